@@ -1,0 +1,3 @@
+"""Train an instance segmenter on COCO-format data, verify its ONNX, and run RGB-D SLAM with it."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,81 @@
+"""The table of verbs. A verb's module is imported when the verb is called, so that `cohdc --help` costs nothing."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from cohdc_train.errors import CohdcError, MissingExtraError
+
+
+class Verb(NamedTuple):
+    """A row of the table: where the typed function (or the group of them) behind a verb lies."""
+
+    module: str
+    attribute: str
+    summary: str
+
+
+VERBS = {
+    "demo": Verb("demo", "demo", "the whole way on a rendered room: data, training, ONNX, SLAM, scores, report"),
+    "data": Verb("data.doctor", "COMMANDS", "look at a COCO-format folder: counts per class and split"),
+    "synth": Verb("synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"),
+    "fit": Verb("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),
+    "validate": Verb("train.cli", "validate", "score a checkpoint on a COCO-format folder"),
+    "export": Verb("export", "export", "checkpoint -> ONNX, run and compared before it is kept"),
+    "predict": Verb("predict", "predict", "run an ONNX on images: overlays and COCO JSON (no torch)"),
+    "slam": Verb("slam.run", "slam", "RGB-D sequence -> trajectory, map tracking with people removed (no torch)"),
+    "evaluate": Verb("trajectory", "evaluate", "ATE and RPE of a trajectory against ground truth"),
+    "env": Verb("env", "env", "versions of everything that matters, and what is wrong with them"),
+}
+
+_TRAIN_PACKAGES = frozenset(
+    ["torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "kornia", "rich"]
+    + ["tensorboard", "embreex"]
+)
+
+
+def help_text() -> str:
+    """What `cohdc --help` prints."""
+    rows = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
+    return f"usage: cohdc VERB [options]\n\n{rows}\n\ncohdc VERB --help tells a verb's options; cohdc --version the version."
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb; returns the exit code: 0 done, 1 a user's error in one line, 2 usage. A bug keeps its traceback."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        print(help_text())
+        return 0 if args else 2
+    if args[0] == "--version":
+        from cohdc_train import __version__
+
+        print(f"cohdc {__version__}")
+        return 0
+    if args[0] not in VERBS:
+        print(f"cohdc: no verb {args[0]!r}; cohdc --help lists them", file=sys.stderr)
+        return 2
+    try:
+        _call(args[0], args[1:])
+    except CohdcError as error:
+        print(f"cohdc {args[0]}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _call(name: str, args: list[str]) -> None:
+    verb = VERBS[name]
+    try:
+        component = getattr(importlib.import_module(f"cohdc_train.{verb.module}"), verb.attribute)
+        if name in ("fit", "validate"):  # Lightning's own command line, which reads the arguments itself
+            component(args)
+            return
+        from jsonargparse import auto_cli
+
+        auto_cli(component, args=args, prog=f"cohdc {name}", as_positional=True)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _TRAIN_PACKAGES:
+            raise
+        message = f"{name} needs {package}, which is not installed: pip install 'cohdc-train[train]'"
+        raise MissingExtraError(message) from error
