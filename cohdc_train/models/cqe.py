@@ -1,0 +1,80 @@
+"""Contour quality evaluation (paper 2.1.2): a head that regresses how well a predicted mask covers its object.
+
+The paper feeds the true contour to the head; at inference there is none, so the truth enters through the target only.
+"""
+
+import torch
+import torch.nn.functional as F  # noqa: N812 torch's own name for it
+from torch import Tensor, nn
+from torchvision.ops import roi_align
+
+
+class CQEHead(nn.Module):
+    """Four 3x3 convolutions (the last with stride 2) and three fully connected layers (paper 2.1.2).
+
+    The predicted mask is max-pooled to the RoI feature's size and concatenated to it.
+
+    Args:
+        in_channels: channels of the RoI feature.
+        num_classes: classes without background; one quality is regressed per class.
+        channels: width of the convolutions (paper: 256).
+        fc: width of the first two fully connected layers (paper: 1024).
+        roi_size: side of the RoI feature, cells.
+    """
+
+    def __init__(self, in_channels: int, num_classes: int, channels: int = 256, fc: int = 1024, roi_size: int = 14):
+        super().__init__()
+        widths = [in_channels + 1, channels, channels, channels, channels]
+        strides = [1, 1, 1, 2]
+        layers: list[nn.Module] = []
+        for i in range(4):
+            layers += [nn.Conv2d(widths[i], widths[i + 1], 3, stride=strides[i], padding=1), nn.ReLU(inplace=True)]
+        side = (roi_size + 1) // 2
+        self.convs = nn.Sequential(*layers)
+        self.fcs = nn.Sequential(
+            nn.Linear(channels * side * side, fc), nn.ReLU(inplace=True), nn.Linear(fc, fc), nn.ReLU(inplace=True)
+        )
+        self.quality = nn.Linear(fc, num_classes)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+                nn.init.zeros_(module.bias)
+
+    def forward(self, features: Tensor, masks: Tensor) -> Tensor:
+        """features: [K, C, 14, 14]; masks: [K, 28, 28] probabilities of one class. Returns [K, num_classes], linear."""
+        pooled = F.max_pool2d(masks[:, None], kernel_size=masks.shape[-1] // features.shape[-1])
+        x = self.convs(torch.cat([features, pooled], dim=1))
+        quality: Tensor = self.quality(self.fcs(x.flatten(1)))
+        return quality
+
+
+@torch.no_grad()
+def cqe_targets(masks: Tensor, boxes: Tensor, gt_masks: Tensor, matched: Tensor) -> Tensor:
+    """IoU of each predicted mask with its whole ground-truth mask, also with what lies outside the box.
+
+    masks: [K, M, M] probabilities; boxes: [K, 4] xyxy, px; gt_masks: [G, H, W] of 0 and 1; matched: [K] index into G.
+    Returns [K] in 0..1. Counted on the box's M x M grid, in whose cells the whole object's area is expressed too.
+    """
+    side = masks.shape[-1]
+    truth = gt_masks.to(boxes.dtype)
+    rois = torch.cat([matched[:, None].to(boxes.dtype), boxes], dim=1)
+    inside = roi_align(truth[:, None], rois, (side, side), sampling_ratio=2, aligned=True)[:, 0]
+    predicted = (masks > 0.5).to(boxes.dtype)
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    whole = truth.sum(dim=(1, 2))[matched] * side**2 / area.clamp(min=1.0)
+    intersection = (predicted * inside).sum(dim=(1, 2))
+    union = predicted.sum(dim=(1, 2)) + whole - intersection
+    return (intersection / union.clamp(min=1e-6)).clamp(0.0, 1.0)
+
+
+def cqe_loss(quality: Tensor, labels: Tensor, targets: Tensor) -> Tensor:
+    """Half the mean squared error over RoIs with a target above 0.
+
+    quality: [K, num_classes]; labels: [K] 0-based class; targets: [K]. Without such a RoI the loss is a zero that
+    still reaches every parameter, so that no rank of a distributed run waits for another.
+    """
+    valid = targets > 0
+    if not bool(valid.any()):
+        return quality.sum() * 0
+    predicted = quality.gather(1, labels[:, None])[:, 0]
+    return 0.5 * F.mse_loss(predicted[valid].float(), targets[valid].float())

@@ -1,0 +1,169 @@
+"""The padded forward: from uint8 images to a fixed number of detections, the same code in torch and in the export.
+
+No shape depends on what is in the image; rows that hold no detection are zeros behind `count`.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cohdc_train.models.mask_rcnn import ROI_LEVELS, ROI_STRIDES, MaskRCNN
+from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels
+
+_RPN_NMS_IOU = 0.7
+_CANDIDATES = 1000  # best (proposal, class) pairs that enter the last suppression
+_MIN_SIDE = 1e-2  # px on the canvas; smaller boxes hold nothing
+
+
+class PaddedDetections(NamedTuple):
+    """The output tensors in the order of `cohdc_train.signature.OUTPUTS`; boxes in px of the input image."""
+
+    boxes: Tensor
+    labels: Tensor
+    scores: Tensor
+    quality: Tensor
+    masks: Tensor
+    count: Tensor
+
+
+class Detector(torch.nn.Module):
+    """A MaskRCNN as the function that is exported: uint8 images [B, H, W, 3] RGB -> PaddedDetections."""
+
+    def __init__(self, network: MaskRCNN) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> PaddedDetections:
+        """images: uint8 [B, H, W, 3] RGB, any H and W. Rows of the result fall by score."""
+        rows, columns = self.network.config.canvas
+        canvas, geometry = letterbox(images, rows, columns)
+        found = detect_on_canvas(self.network, canvas, geometry[None, :2].expand(images.shape[0], 2))
+        return found._replace(boxes=found.boxes * geometry[[3, 2, 3, 2]])
+
+
+@torch.no_grad()
+def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
+    """Detections of images of any sizes, each in its own pixels.
+
+    images: uint8 [3, H, W] RGB. Returns per image `boxes` [n, 4] xyxy px, `labels` [n] 0-based, `scores` [n],
+    `quality` [n], `masks` [n, 28, 28] probabilities inside the box. The network should be in evaluation mode.
+    """
+    rows, columns = network.config.canvas
+    fitted = [letterbox(image.permute(1, 2, 0)[None], rows, columns) for image in images]
+    geometry = torch.stack([g for _, g in fitted])
+    found = detect_on_canvas(network, torch.cat([c for c, _ in fitted]), geometry[:, :2])
+    boxes = found.boxes * geometry[:, None, [3, 2, 3, 2]]
+    results = []
+    for i in range(len(images)):
+        n = int(found.count[i])
+        fields: dict[str, Any] = {"boxes": boxes[i, :n]}
+        fields |= {name: getattr(found, name)[i, :n] for name in ("labels", "scores", "quality", "masks")}
+        results.append(fields)
+    return results
+
+
+def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> PaddedDetections:
+    """canvas: float [B, 3, H, W] in 0..1; content: [B, 2] height and width in px of what is not padding."""
+    pyramid = network.features(canvas)
+    limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
+    proposals = _propose(network, list(pyramid.values()), limit)
+    levels = [pyramid[name] for name in ROI_LEVELS]
+    boxes, labels, scores, count = _classify(network, levels, proposals, limit)
+    masks, quality = _segment(network, levels, boxes, labels)
+    batch, n = labels.shape
+    present = torch.arange(n, device=count.device)[None] < count[:, None]
+    masks = masks.reshape(batch, n, *masks.shape[-2:]) * present[:, :, None, None]
+    return PaddedDetections(boxes, labels, scores, quality.reshape(batch, n) * present, masks, count)
+
+
+def _propose(network: MaskRCNN, features: list[Tensor], limit: Tensor) -> Tensor:
+    """[B, R, 4] proposals, canvas px; rows without one are zero boxes."""
+    rpn, wanted = network.rpn, network.config.proposals[1]
+    objectness, deltas = rpn.head(features)
+    boxes, scores = [], []
+    for level, (logits, delta) in enumerate(zip(objectness, deltas, strict=True)):
+        score, index = _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
+        stride = 4 * 2**level
+        anchors = _anchors(rpn.anchor_generator.cell_anchors[level].to(logits.device), index, logits.shape[3], stride)
+        delta = _flatten(delta, 4).gather(1, index[:, :, None].expand(-1, -1, 4))
+        box = _decode(delta.float(), anchors, (1.0, 1.0, 1.0, 1.0), limit)
+        score = torch.where(_is_solid(box), score.float().sigmoid(), 0.0)
+        score = torch.where(nms_keep(box, score, _RPN_NMS_IOU, 0.0), score, 0.0)
+        boxes.append(box)
+        scores.append(score)
+    score, index = torch.cat(scores, dim=1).topk(min(wanted, sum(s.shape[1] for s in scores)), dim=1)
+    box = torch.cat(boxes, dim=1).gather(1, index[:, :, None].expand(-1, -1, 4))
+    return box * (score > 0)[:, :, None]
+
+
+def _classify(
+    network: MaskRCNN, levels: list[Tensor], proposals: Tensor, limit: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Boxes [B, N, 4], 0-based labels [B, N], scores [B, N] falling, count [B]; padded with zeros."""
+    config, heads = network.config, network.roi_heads
+    batch, rois = proposals.shape[:2]
+    pooled = roi_pool_levels(levels, proposals, ROI_STRIDES, 7)
+    logits, deltas = heads.box_predictor(heads.box_head(pooled))
+    classes = network.num_classes
+    scores = logits.float().softmax(dim=1)[:, 1:].reshape(batch, rois * classes)
+    deltas = deltas.float().reshape(batch, rois * (classes + 1), 4)
+    solid = _is_solid(proposals)[:, :, None].expand(batch, rois, classes).reshape(batch, rois * classes)
+    scores, index = torch.where(solid, scores, 0.0).topk(min(_CANDIDATES, rois * classes), dim=1)
+    roi, label = index // classes, index % classes
+    deltas = deltas.gather(1, (roi * (classes + 1) + label + 1)[:, :, None].expand(-1, -1, 4))
+    boxes = _decode(deltas, proposals.gather(1, roi[:, :, None].expand(-1, -1, 4)), heads.box_coder.weights, limit)
+    scores = torch.where(_is_solid(boxes), scores, 0.0)
+    apart = label.float() * (max(config.canvas) + 1.0)  # no two classes overlap
+    keep = nms_keep(boxes + apart[:, :, None], scores, config.nms_iou, config.score_threshold)
+    scores, best = torch.where(keep, scores, 0.0).topk(min(config.detections, scores.shape[1]), dim=1)
+    present = scores > 0
+    boxes = boxes.gather(1, best[:, :, None].expand(-1, -1, 4)) * present[:, :, None]
+    return boxes, label.gather(1, best) * present, scores, present.sum(dim=1)
+
+
+def _segment(network: MaskRCNN, levels: list[Tensor], boxes: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Masks [B * N, M, M] and quality [B * N] of the predicted classes."""
+    heads = network.roi_heads
+    pooled = roi_pool_levels(levels, boxes, ROI_STRIDES, 14)
+    logits = heads.mask_predictor(heads.mask_head(pooled))
+    flat = labels.reshape(-1)
+    side = logits.shape[-1]
+    masks = logits.gather(1, (flat + 1)[:, None, None, None].expand(-1, 1, side, side))[:, 0].sigmoid()
+    if network.cqe is None:
+        return masks.float(), torch.ones_like(masks[:, 0, 0], dtype=torch.float32)
+    quality = network.cqe(pooled, masks).gather(1, flat[:, None])[:, 0]
+    return masks.float(), quality.float().clamp(0.0, 1.0)
+
+
+def _flatten(maps: Tensor, values: int) -> Tensor:
+    """[B, A * values, H, W] -> [B, H * W * A, values]: the order of torchvision's anchors."""
+    batch, channels, height, width = maps.shape
+    return (
+        maps.reshape(batch, channels // values, values, height, width)
+        .permute(0, 3, 4, 1, 2)
+        .reshape(batch, height * width * (channels // values), values)
+    )
+
+
+def _anchors(cell: Tensor, index: Tensor, width: int, stride: int) -> Tensor:
+    """[B, k, 4] anchors at flat positions: cell is [A, 4], index counts anchors fastest, then columns, then rows."""
+    shapes = cell.shape[0]
+    x, y = (index // shapes) % width * stride, index // (shapes * width) * stride
+    return cell[index % shapes] + torch.stack([x, y, x, y], dim=2)
+
+
+def _decode(deltas: Tensor, boxes: Tensor, weights: tuple[float, ...], limit: Tensor) -> Tensor:
+    """Box deltas [B, n, 4] applied to boxes [B, n, 4] and clipped to limit [B, 1, 4] (R-CNN's parametrisation)."""
+    size = boxes[:, :, 2:] - boxes[:, :, :2]
+    centre = boxes[:, :, :2] + 0.5 * size
+    shift = deltas * deltas.new_tensor([1.0 / weight for weight in weights])
+    centre = centre + shift[:, :, :2] * size
+    half = 0.5 * torch.exp(shift[:, :, 2:].clamp(max=4.135)) * size  # at most 1000 / 16 times as large
+    corners = torch.cat([centre - half, centre + half], dim=2)
+    return torch.minimum(corners.clamp(min=0.0), limit)
+
+
+def _is_solid(boxes: Tensor) -> Tensor:
+    """[B, n] bool: both sides of the box are long enough to hold something."""
+    return ((boxes[:, :, 2:] - boxes[:, :, :2]) >= _MIN_SIDE).all(dim=2)

@@ -1,0 +1,255 @@
+"""HDC Mask R-CNN with a CQE head: the parts, and the losses that train them (paper 2.1).
+
+Torchvision's detection parts wherever they fit, under torchvision's names, so that its Mask R-CNN state dicts load.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
+from torchvision.models.detection.image_list import ImageList
+from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
+from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss, maskrcnn_loss
+from torchvision.models.detection.rpn import RegionProposalNetwork, RPNHead
+from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
+from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
+
+from cohdc_train.models.backbones import Depth, HDCResNet, load_backbone_weights
+from cohdc_train.models.cqe import CQEHead, cqe_loss, cqe_targets
+
+Target = dict[str, Any]
+ROI_LEVELS = ("0", "1", "2", "3")
+ROI_STRIDES = [4, 8, 16, 32]
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..1
+_CROWD_OVERLAP = 0.5  # share of a background anchor or proposal inside a crowd box from which it is not a negative
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Everything that shapes the network; the number of classes comes from the data.
+
+    Attributes:
+        depth: ResNet of 18, 34 or 50 layers.
+        width: channels of the backbone as a share of ResNet's.
+        rates: dilation patterns of the four stages.
+        weights: torchvision name or local path of ImageNet weights for the backbone; None trains from scratch.
+        norm: "batch" trains BatchNorm, "frozen" keeps the weights' statistics.
+        frozen_stages: how many of stem, layer1 .. layer4 are not trained.
+        canvas: (height, width) in px every image is fitted into.
+        anchor_scales: side of the anchors in px, one per pyramid level from stride 4; a fifth adds the pool level.
+        fpn_channels: width of the pyramid, and of the RPN and mask heads.
+        fc: width of the box and CQE heads' fully connected layers.
+        cqe: "concat" builds the CQE head, "off" leaves it out (quality is then 1).
+        proposals: proposals kept per image in training and at inference.
+        rois: proposals per image that train the box head, a quarter of them positive.
+        detections: rows of the padded output.
+        score_threshold: detections at or below it are dropped.
+        nms_iou: overlap from which the weaker of two detections of a class is dropped.
+    """
+
+    depth: Depth = 50
+    width: float = 1.0
+    rates: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3))
+    weights: str | None = None
+    norm: Literal["batch", "frozen"] = "batch"
+    frozen_stages: int = 0
+    canvas: tuple[int, int] = (800, 1024)
+    anchor_scales: tuple[int, ...] = (32, 64, 128, 256)
+    fpn_channels: int = 256
+    fc: int = 1024
+    cqe: Literal["concat", "off"] = "concat"
+    proposals: tuple[int, int] = (1000, 300)
+    rois: int = 256
+    detections: int = 100
+    score_threshold: float = 0.05
+    nms_iou: float = 0.5
+
+    def __post_init__(self) -> None:
+        if len(self.anchor_scales) not in (4, 5):
+            raise ValueError(f"anchor_scales {self.anchor_scales}: {len(self.anchor_scales)} scales for 4 or 5 levels")
+        if not 0 <= self.frozen_stages <= 5:
+            raise ValueError(f"frozen_stages {self.frozen_stages}: a ResNet has a stem and 4 stages")
+        if self.weights is not None and self.width != 1.0:
+            raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
+
+
+class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]  # torchvision is not typed
+    """Torchvision's RPN, for which a background anchor inside a crowd box is no negative."""
+
+    def assign_targets_to_anchors(
+        self, anchors: list[Tensor], targets: list[Target]
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        labels, matched = super().assign_targets_to_anchors(anchors, targets)
+        for label, anchor, target in zip(labels, anchors, targets, strict=True):
+            label[(label == 0) & _in_crowd(anchor, target)] = -1
+        return labels, matched
+
+
+class Backbone(nn.Module):
+    """HDC ResNet and feature pyramid, under the names that torchvision's BackboneWithFPN uses."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.body = HDCResNet(config.depth, config.width, config.rates, config.norm, config.frozen_stages)
+        if config.weights is not None:
+            load_backbone_weights(self.body, config.depth, config.weights)
+        pool = LastLevelMaxPool() if len(config.anchor_scales) == 5 else None
+        self.fpn = FeaturePyramidNetwork(self.body.out_channels, config.fpn_channels, pool)
+
+    def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
+        """x: [B, 3, H, W] normalised. Returns the pyramid, "0" at stride 4 to "3" at stride 32, perhaps "pool" at 64."""
+        features: OrderedDict[str, Tensor] = self.fpn(self.body(x))
+        return features
+
+
+class MaskRCNN(nn.Module):
+    """The network. `losses` trains it; `cohdc_train.models.inference` runs it.
+
+    Args:
+        num_classes: classes without background.
+        config: its shape.
+
+    Raises:
+        ValueError: the rates leave holes, or the weights do not fit the backbone.
+        FileNotFoundError: the weights are neither a file nor a published name.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, num_classes: int, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.num_classes = num_classes
+        channels = config.fpn_channels
+        self.backbone = Backbone(config)
+        self.rpn = _build_rpn(config)
+        self.roi_heads = _build_roi_heads(config, num_classes)
+        self.cqe = CQEHead(channels, num_classes, channels, config.fc) if config.cqe != "off" else None
+        self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(STD).view(3, 1, 1), persistent=False)
+
+    def features(self, images: Tensor) -> "OrderedDict[str, Tensor]":
+        """images: float [B, 3, H, W] in 0..1. Returns the feature pyramid; sides are padded to multiples of 32 px."""
+        height, width = images.shape[-2:]
+        x = (images - self.mean) / self.std
+        pyramid: OrderedDict[str, Tensor] = self.backbone(F.pad(x, (0, -width % 32, 0, -height % 32)))
+        return pyramid
+
+    def losses(self, images: Tensor, targets: list[Target]) -> dict[str, Tensor]:
+        """The scalar losses of one batch; their sum trains the network.
+
+        images: float [B, 3, H, W] in 0..1 on the canvas; targets: per image `boxes` [n, 4] xyxy px, `labels` [n] from
+        1, `masks` uint8 [n, H, W], and `ignore` [k, 4], the crowd's boxes. n may be 0.
+        """
+        features = self.features(images)
+        sizes = [(int(images.shape[-2]), int(images.shape[-1]))] * len(targets)
+        proposals, rpn_losses = self.rpn(ImageList(images, sizes), features, targets)
+        heads = self.roi_heads
+        sampled, matched, labels, regression = self._sample(proposals, targets)
+        box_features = heads.box_head(heads.box_roi_pool(features, sampled, sizes))
+        logits, deltas = heads.box_predictor(box_features)
+        loss_class, loss_box = fastrcnn_loss(logits.float(), deltas.float(), labels, regression)
+        return {
+            "objectness": rpn_losses["loss_objectness"],
+            "rpn_box": rpn_losses["loss_rpn_box_reg"],
+            "class": loss_class,
+            "box": loss_box,
+            **self._mask_losses(features, sizes, sampled, matched, labels, targets),
+        }
+
+    def _sample(
+        self, proposals: list[Tensor], targets: list[Target]
+    ) -> tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]:
+        """Proposals that train the heads: their boxes, matched object, label and box deltas, per image."""
+        heads = self.roi_heads
+        gt_boxes = [t["boxes"].to(proposals[0].dtype) for t in targets]
+        proposals = heads.add_gt_proposals([p.detach() for p in proposals], gt_boxes)
+        matched, labels = heads.assign_targets_to_proposals(proposals, gt_boxes, [t["labels"] for t in targets])
+        for label, proposal, target in zip(labels, proposals, targets, strict=True):
+            label[(label == 0) & _in_crowd(proposal, target)] = -1
+        chosen = heads.subsample(labels)
+        proposals = [p[c] for p, c in zip(proposals, chosen, strict=True)]
+        labels = [label[c] for label, c in zip(labels, chosen, strict=True)]
+        matched = [m[c] for m, c in zip(matched, chosen, strict=True)]
+        truths = [
+            boxes[m] if len(boxes) else boxes.new_zeros((len(m), 4)) for boxes, m in zip(gt_boxes, matched, strict=True)
+        ]
+        return proposals, matched, labels, list(heads.box_coder.encode(truths, proposals))
+
+    def _mask_losses(
+        self,
+        features: "OrderedDict[str, Tensor]",
+        sizes: list[tuple[int, int]],
+        sampled: list[Tensor],
+        matched: list[Tensor],
+        labels: list[Tensor],
+        targets: list[Target],
+    ) -> dict[str, Tensor]:
+        """Mask and CQE losses over the positive proposals."""
+        heads = self.roi_heads
+        positive = [torch.nonzero(label > 0)[:, 0] for label in labels]
+        boxes = [b[p] for b, p in zip(sampled, positive, strict=True)]
+        matches = [m[p] for m, p in zip(matched, positive, strict=True)]
+        pooled = heads.mask_roi_pool(features, boxes, sizes)
+        logits = heads.mask_predictor(heads.mask_head(pooled)).float()
+        gt_masks = [t["masks"] for t in targets]
+        gt_labels = [t["labels"] for t in targets]
+        losses = {"mask": maskrcnn_loss(logits, boxes, gt_masks, gt_labels, matches)}
+        if self.cqe is None:
+            return losses
+        classes = torch.cat([label[p] for label, p in zip(labels, positive, strict=True)]) - 1
+        rows = torch.arange(len(classes), device=classes.device)
+        probabilities = logits[rows, classes + 1].sigmoid()
+        quality = self.cqe(pooled, probabilities.to(pooled.dtype))
+        per_image = zip(probabilities.split([len(b) for b in boxes]), boxes, gt_masks, matches, strict=True)
+        truth = [cqe_targets(p, b.float(), g, m) if len(b) else b.new_zeros(0) for p, b, g, m in per_image]
+        losses["cqe"] = cqe_loss(quality, classes, torch.cat(truth))
+        return losses
+
+
+def _in_crowd(boxes: Tensor, target: Target) -> Tensor:
+    """[n] bool: more than half of the box's area lies inside one of the target's `ignore` boxes."""
+    crowd = target.get("ignore")
+    if crowd is None or not len(crowd):
+        return torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
+    corner = torch.minimum(boxes[:, None, 2:], crowd[None, :, 2:]) - torch.maximum(
+        boxes[:, None, :2], crowd[None, :, :2]
+    )
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(dim=1).clamp(min=1e-6)
+    share: Tensor = corner.clamp(min=0).prod(dim=2) / area[:, None]
+    return (share > _CROWD_OVERLAP).any(dim=1)
+
+
+def _build_rpn(config: NetworkConfig) -> CrowdAwareRPN:
+    anchors = AnchorGenerator(
+        tuple((scale,) for scale in config.anchor_scales), ((0.5, 1.0, 2.0),) * len(config.anchor_scales)
+    )
+    head = RPNHead(config.fpn_channels, anchors.num_anchors_per_location()[0])
+    top = {"training": config.proposals[0], "testing": config.proposals[1]}
+    return CrowdAwareRPN(anchors, head, 0.7, 0.3, 256, 0.5, {k: 2 * n for k, n in top.items()}, top, 0.7)
+
+
+def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:
+    channels = config.fpn_channels
+    return RoIHeads(
+        box_roi_pool=MultiScaleRoIAlign(list(ROI_LEVELS), 7, 2),
+        box_head=TwoMLPHead(channels * 49, config.fc),
+        box_predictor=FastRCNNPredictor(config.fc, num_classes + 1),
+        fg_iou_thresh=0.5,
+        bg_iou_thresh=0.5,
+        batch_size_per_image=config.rois,
+        positive_fraction=0.25,
+        bbox_reg_weights=None,
+        score_thresh=config.score_threshold,
+        nms_thresh=config.nms_iou,
+        detections_per_img=config.detections,
+        mask_roi_pool=MultiScaleRoIAlign(list(ROI_LEVELS), 14, 2),
+        mask_head=MaskRCNNHeads(channels, (channels,) * 4, 1),
+        mask_predictor=MaskRCNNPredictor(channels, channels, num_classes + 1),
+    )

@@ -1,0 +1,89 @@
+"""Four operators with fixed output shapes, so that the detector exports with every inner shape known.
+
+Each is an ordinary torch function wrapped as a custom operator; `cohdc_train.export` says what it is in ONNX.
+"""
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+from torchvision.ops import nms, roi_align
+
+SAMPLING_RATIO = 2
+CANONICAL_SIDE, CANONICAL_LEVEL = 224, 4  # FPN's rule: a 224 px box is pooled from level 4 (stride 16)
+
+
+def fitted_size(height: int, width: int, canvas: tuple[int, int]) -> tuple[int, int]:
+    """(height, width) in px of an image resized into the canvas, its aspect kept to the nearest pixel; integers only."""
+    rows, columns = canvas
+    if rows * width <= columns * height:
+        return rows, max(1, (2 * width * rows + height) // (2 * height))
+    return max(1, (2 * height * columns + width) // (2 * width)), columns
+
+
+@torch.library.custom_op("cohdc::letterbox", mutates_args=())
+def letterbox(images: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+    """Resize images into the top left of a black canvas (bilinear, antialiased).
+
+    images: uint8 [B, H, W, 3]. Returns float32 [B, 3, rows, columns] in 0..1 and float32 [4]: height and width of the
+    content in canvas px, then image px per canvas px along y and x.
+    """
+    height, width = images.shape[1:3]
+    size = fitted_size(height, width, (rows, columns))
+    x = images.permute(0, 3, 1, 2).float()
+    x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True) / 255
+    geometry = torch.tensor([size[0], size[1], height / size[0], width / size[1]], device=images.device)
+    return F.pad(x, (0, columns - size[1], 0, rows - size[0])).contiguous(), geometry
+
+
+@letterbox.register_fake
+def _(images: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+    canvas = images.new_empty((images.shape[0], 3, rows, columns), dtype=torch.float32)
+    return canvas, images.new_empty((4,), dtype=torch.float32)
+
+
+@torch.library.custom_op("cohdc::nms_keep", mutates_args=())
+def nms_keep(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float) -> Tensor:
+    """Greedy non-maximum suppression of each image by itself.
+
+    boxes: float32 [B, n, 4] xyxy; scores: float32 [B, n]. Returns bool [B, n]: kept, and scored above the threshold.
+    """
+    keep = torch.zeros_like(scores, dtype=torch.bool)
+    for i in range(boxes.shape[0]):
+        candidates = torch.nonzero(scores[i] > score_threshold)[:, 0]
+        kept = nms(boxes[i, candidates], scores[i, candidates], iou_threshold)
+        keep[i, candidates[kept]] = True
+    return keep
+
+
+@nms_keep.register_fake
+def _(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float) -> Tensor:
+    return torch.empty_like(scores, dtype=torch.bool)
+
+
+@torch.library.custom_op("cohdc::roi_pool_levels", mutates_args=())
+def roi_pool_levels(features: list[Tensor], boxes: Tensor, strides: list[int], side: int) -> Tensor:
+    """RoIAlign of every box from the pyramid level that suits its size (FPN, eq. 1 of Lin et al. 2017).
+
+    features: [B, C, H / s, W / s] for each stride s; boxes: float32 [B, R, 4] xyxy, canvas px.
+    Returns [B * R, C, side, side].
+    """
+    count = boxes.shape[0] * boxes.shape[1]
+    flat = boxes.reshape(count, 4)
+    batch = torch.arange(boxes.shape[0], device=boxes.device).repeat_interleave(boxes.shape[1])
+    rois = torch.cat([batch[:, None].to(flat.dtype), flat], dim=1)
+    area = (flat[:, 2] - flat[:, 0]) * (flat[:, 3] - flat[:, 1])
+    level = torch.floor(CANONICAL_LEVEL + torch.log2(area.sqrt() / CANONICAL_SIDE + 1e-8) + 1e-6)
+    pooled = features[0].new_zeros((count, features[0].shape[1], side, side))
+    first = strides[0].bit_length() - 1
+    level = level.clamp(first, first + len(features) - 1) - first
+    for i, feature in enumerate(features):
+        chosen = torch.nonzero(level == i)[:, 0]
+        pooled[chosen] = roi_align(
+            feature, rois[chosen].to(feature.dtype), (side, side), 1.0 / strides[i], SAMPLING_RATIO
+        )
+    return pooled
+
+
+@roi_pool_levels.register_fake
+def _(features: list[Tensor], boxes: Tensor, strides: list[int], side: int) -> Tensor:
+    return features[0].new_empty((boxes.shape[0] * boxes.shape[1], features[0].shape[1], side, side))
