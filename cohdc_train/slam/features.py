@@ -1,0 +1,133 @@
+"""ORB corners spread over the image, found only where nothing dynamic lies, with the depth readings that can be trusted."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.camera import Camera
+
+SCALE = 1.2  # between two levels of the image pyramid
+LEVELS = 8
+_CELL = 32  # px at the level of the corner
+_POOL = 2.5  # corners detected per corner kept: what the grid chooses from
+_EDGE_PATCH = 2  # px: a depth edge this near to a corner spoils its depth
+_EDGE_RELATIVE = 0.04  # of the depth: a larger step inside the patch is an edge
+_MASK_BAND = 2  # px beside the mask where depth is refused
+
+
+@dataclass(frozen=True)
+class Features:
+    """n corners of one frame.
+
+    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n] int64 pyramid level;
+    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted.
+    """
+
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+    octaves: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+    depths: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = len(self.pixels)
+        shapes = (self.pixels.shape, self.points.shape, self.octaves.shape, self.descriptors.shape, self.depths.shape)
+        if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,)):
+            raise ValueError(f"features disagree in shape: {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """[n] standard deviation of a corner's position, px: it grows with the pyramid level."""
+        return np.asarray(SCALE**self.octaves, dtype=np.float64)
+
+
+class FeatureExtractor:
+    """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a crowd costs none."""
+
+    def __init__(self, camera: Camera, budget: int = 1000) -> None:
+        self.camera = camera
+        self.budget = budget
+        pool = int(budget * _POOL)
+        self._orb = cv2.ORB_create(
+            nfeatures=pool,
+            scaleFactor=SCALE,
+            nlevels=LEVELS,
+            edgeThreshold=19,
+            scoreType=cv2.ORB_FAST_SCORE,
+            fastThreshold=7,
+        )
+        shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
+        self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
+
+    def __call__(
+        self, rgb: NDArray[np.uint8], depth: NDArray[np.float32], mask: NDArray[np.bool_] | None = None
+    ) -> Features:
+        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic (no corner is taken there)."""
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
+        found = self._orb.detect(gray, allowed)
+        table = np.array([(*k.pt, k.octave, k.response) for k in found], dtype=np.float64).reshape(-1, 4)
+        chosen = self._spread(table)
+        kept, words = self._orb.compute(gray, [found[i] for i in chosen])
+        if words is None:
+            kept, words = (), np.zeros((0, 32), dtype=np.uint8)
+        pixels = np.array([k.pt for k in kept], dtype=np.float64).reshape(-1, 2)
+        octaves = np.array([k.octave for k in kept], dtype=np.int64)
+        depths = sample_depth(depth, pixels, mask)
+        descriptors = np.ascontiguousarray(words).view(np.uint64)
+        return Features(pixels, self.camera.undistort(pixels), octaves, descriptors, depths)
+
+    def _spread(self, table: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Rows of (x, y, octave, response) to keep: per level, the best of every cell first, then the second best."""
+        octave = table[:, 2].astype(np.int64)
+        size = _CELL * SCALE**octave
+        column, row = (table[:, 0] // size).astype(np.int64), (table[:, 1] // size).astype(np.int64)
+        cell = (octave * 10_000 + row) * 10_000 + column
+        order = np.lexsort((-table[:, 3], cell))
+        rank = np.empty(len(table), dtype=np.int64)
+        rank[order] = _running_index(cell[order])
+        order = np.lexsort((-table[:, 3], rank, octave))
+        return np.sort(order[_running_index(octave[order]) < self._quota[octave[order]]])
+
+
+def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """groups: [n] sorted keys. Returns [n] 0, 1, 2, ... restarting at every new key."""
+    index = np.arange(len(groups))
+    starts = np.r_[True, groups[1:] != groups[:-1]][: len(groups)]
+    return index - np.maximum.accumulate(np.where(starts, index, 0))
+
+
+def sample_depth(
+    depth: NDArray[np.float32], pixels: NDArray[np.float64], mask: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """Depth at corners, refused beside depth edges and beside the mask, where a sensor mixes near and far.
+
+    depth: [H, W] m, 0 = none; pixels: [n, 2] px; mask: [H, W], True = dynamic. Returns [n] m, nan where refused.
+    """
+    if len(pixels) == 0:
+        return np.zeros(0)
+    height, width = depth.shape
+    offsets = np.arange(-_EDGE_PATCH, _EDGE_PATCH + 1)
+    x, y = np.rint(pixels).astype(np.int64).T
+    columns = np.clip(x[:, None, None] + offsets[None, None, :], 0, width - 1)
+    rows = np.clip(y[:, None, None] + offsets[None, :, None], 0, height - 1)
+    patch = depth[rows, columns].reshape(len(pixels), -1).astype(np.float64)
+    centre = patch[:, patch.shape[1] // 2]
+    far = patch.max(axis=1)
+    near = np.where(patch > 0, patch, np.inf).min(axis=1)
+    refused = (centre <= 0) | (far - near > _EDGE_RELATIVE * centre)
+    if mask is not None:
+        reach = np.ones((2 * _MASK_BAND + 1, 2 * _MASK_BAND + 1), dtype=np.uint8)
+        band = cv2.dilate(mask.astype(np.uint8), reach)
+        refused |= band[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0
+    return np.where(refused, np.nan, centre)
+
+
+def hamming(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """first, second: [..., 4] descriptors. Returns [...] how many of the 256 bits differ."""
+    return np.bitwise_count(first ^ second).sum(axis=-1, dtype=np.int64)

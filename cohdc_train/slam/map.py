@@ -1,0 +1,147 @@
+"""The map: points, keyframes, and which keyframe sees which point."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.features import LEVELS, SCALE, Features
+from cohdc_train.slam.matching import Matches, Projected
+from cohdc_train.slam.optimization import Array, Observations, to_local
+
+_NEAR = 0.1  # m
+_VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
+
+
+@dataclass
+class Keyframe:
+    """A frame the map keeps.
+
+    index: place in the map's list; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n] int64, the map point of every
+    corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the place again.
+    """
+
+    index: int
+    t: float
+    T_cw: Array
+    features: Features
+    point_ids: NDArray[np.int64]
+    thumbnail: NDArray[np.float32]
+
+    def seen_points(self) -> NDArray[np.int64]:
+        """Ids of the points this keyframe sees."""
+        return self.point_ids[self.point_ids >= 0]
+
+    def centre(self) -> Array:
+        """[3] position of the camera in the world, m."""
+        return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
+
+
+def observations(features: Features, corners: NDArray[np.int64]) -> Observations:
+    """What a frame measured at some of its corners."""
+    return Observations(features.points[corners], features.depths[corners], features.sigmas[corners])
+
+
+class Map:
+    """Points live in arrays that grow by doubling; an id is a row and is never reused."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self.keyframes: list[Keyframe] = []
+        self.size = 0
+        self.positions = np.zeros((1024, 3))
+        self.descriptors = np.zeros((1024, 4), dtype=np.uint64)
+        self.directions = np.zeros((1024, 3))  # sum of unit vectors from camera centres to the point
+        self.reach = np.zeros(1024)  # m: from further away not even the finest level shows the point
+        self.seen_by = np.zeros(1024, dtype=np.int64)  # keyframes
+        self.born = np.zeros(1024, dtype=np.int64)  # keyframe index
+        self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
+        self.found = np.zeros(1024, dtype=np.int64)  # frames that did
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
+        self.keyframes.append(keyframe)
+        ids = keyframe.seen_points()
+        self.seen_by[ids] += 1
+        self._add_directions(ids, keyframe)
+
+    def add_points(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
+        """New points at the depth that was measured at corners of a keyframe."""
+        features, count = keyframe.features, len(corners)
+        self._reserve(self.size + count)
+        ids = np.arange(self.size, self.size + count)
+        self.size += count
+        local = self.camera.backproject(features.points[corners], features.depths[corners])
+        self.positions[ids] = (local - keyframe.T_cw[:3, 3]) @ keyframe.T_cw[:3, :3]
+        self.descriptors[ids] = features.descriptors[corners]
+        self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[corners]
+        self.born[ids] = keyframe.index
+        self.visible[ids] = self.found[ids] = 1
+        self.observe(keyframe, Matches(ids, corners))
+
+    def observe(self, keyframe: Keyframe, matches: Matches) -> None:
+        """Corners of a keyframe, free so far, are measurements of points."""
+        keyframe.point_ids[matches.corners] = matches.points
+        self.seen_by[matches.points] += 1
+        self._add_directions(matches.points, keyframe)
+
+    def forget(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
+        """Corners of a keyframe are no measurements of their points."""
+        np.subtract.at(self.seen_by, keyframe.point_ids[corners], 1)
+        keyframe.point_ids[corners] = -1
+
+    def replace(self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
+        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point."""
+        alias = np.arange(self.size + 1)
+        alias[old] = new
+        alias[-1] = -1
+        for keyframe in keyframes:
+            changed = np.flatnonzero(alias[keyframe.point_ids] != keyframe.point_ids)
+            ids = alias[keyframe.point_ids[changed]]
+            self.forget(keyframe, changed)
+            fresh = ~np.isin(ids, keyframe.point_ids)
+            _, first = np.unique(ids, return_index=True)
+            fresh &= np.isin(np.arange(len(ids)), first)
+            self.observe(keyframe, Matches(ids[fresh], changed[fresh]))
+
+    def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
+        """Keyframes that see at least one of the points, those that see most first."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        flags[ids] = True
+        shared = np.array([np.count_nonzero(flags[k.point_ids]) for k in self.keyframes])
+        order = np.argsort(-shared, kind="stable")[:limit]
+        return [self.keyframes[i] for i in order if shared[i] > 0]
+
+    def points_of(self, keyframes: list[Keyframe]) -> NDArray[np.int64]:
+        """Ids of the points that any of the keyframes sees, rising."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        for keyframe in keyframes:
+            flags[keyframe.point_ids] = True
+        return np.flatnonzero(flags[:-1])
+
+    def project(self, ids: NDArray[np.int64], T_cw: Array) -> Projected:
+        """The points among `ids` that a camera at T_cw should see."""
+        camera, local = self.camera, to_local(T_cw, self.positions[ids])
+        ids, local = ids[local[:, 2] > _NEAR], local[local[:, 2] > _NEAR]
+        pixels = camera.project(local)
+        distance = np.linalg.norm(local, axis=1)
+        towards = local @ T_cw[:3, :3]
+        sums = self.directions[ids]
+        cosine = (towards * sums).sum(axis=1) / (distance * np.linalg.norm(sums, axis=1) + 1e-12)
+        level = np.log(np.maximum(self.reach[ids], 1e-9) / distance) / np.log(SCALE)
+        inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        inside &= (cosine > _VIEW_COSINE) & (level > -1.0) & (level < LEVELS)
+        levels = np.clip(np.rint(level[inside]), 0, LEVELS - 1).astype(np.int64)
+        return Projected(ids[inside], pixels[inside], levels, self.descriptors[ids[inside]])
+
+    def _add_directions(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
+        offset = self.positions[ids] - keyframe.centre()
+        self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
+
+    def _reserve(self, count: int) -> None:
+        names = ("positions", "descriptors", "directions", "reach", "seen_by", "born", "visible", "found")
+        while len(self.positions) < count:
+            for name in names:
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))

@@ -1,0 +1,91 @@
+"""Finding the corners of a frame that belong to map points, by projection and descriptor."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cohdc_train.slam.features import Features, hamming
+
+
+@dataclass(frozen=True)
+class Matches:
+    """points: [m] int64 map point ids; corners: [m] int64 rows of the frame's features. Both without repetition."""
+
+    points: NDArray[np.int64]
+    corners: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, rows: NDArray[np.bool_]) -> "Matches":
+        """The chosen rows."""
+        return Matches(self.points[rows], self.corners[rows])
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Map points as a camera should see them.
+
+    ids: [m] int64; pixels: [m, 2] undistorted px; levels: [m] int64 pyramid level expected; descriptors: [m, 4] uint64.
+    """
+
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+    levels: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+
+
+def match_projected(
+    projected: Projected, features: Features, radius: float, max_distance: int = 90, ratio: float = 0.9
+) -> Matches:
+    """Nearest descriptor among the corners within `radius` px (times the corner's scale) and one level of each point.
+
+    max_distance: bits; ratio: the best must beat this share of the second best. One corner takes one point.
+    """
+    if len(projected.ids) == 0 or len(features) == 0:
+        return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+    widest = radius * float(features.sigmas.max())
+    tree = cKDTree(projected.pixels)
+    pairs = tree.sparse_distance_matrix(cKDTree(features.points), widest, output_type="ndarray")
+    i, j = pairs["i"].astype(np.int64), pairs["j"].astype(np.int64)
+    near = pairs["v"] <= radius * features.sigmas[j]
+    near &= np.abs(features.octaves[j] - projected.levels[i]) <= 1
+    i, j = i[near], j[near]
+    bits = hamming(projected.descriptors[i], features.descriptors[j])
+    keep = bits <= max_distance
+    i, j = one_to_one(i[keep], j[keep], bits[keep], ratio)
+    return Matches(projected.ids[i], j)
+
+
+def one_to_one(
+    i: NDArray[np.int64], j: NDArray[np.int64], bits: NDArray[np.int64], ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Candidate pairs [k] with their distances, thinned: the best j of every i that passes the ratio, then of every j
+    the best i."""
+    order = np.lexsort((j, bits, i))
+    i, j, bits = i[order], j[order], bits[order]
+    first = np.r_[True, i[1:] != i[:-1]][: len(i)]
+    best = np.flatnonzero(first)
+    second = np.minimum(best + 1, len(i) - 1)
+    has_second = (second > best) & (i[second] == i[best])
+    clear = ~has_second | (bits[best] <= ratio * bits[second])
+    i, j, bits = i[best][clear], j[best][clear], bits[best][clear]
+    order = np.lexsort((i, bits, j))
+    first = np.r_[True, j[order][1:] != j[order][:-1]][: len(j)]
+    return i[order][first], j[order][first]
+
+
+def match_descriptors(
+    ids: NDArray[np.int64], descriptors: NDArray[np.uint64], features: Features, max_distance: int = 60
+) -> Matches:
+    """Mutually nearest descriptors without any idea of the pose. ids: [m]; descriptors: [m, 4] of the map points."""
+    if len(ids) == 0 or len(features) == 0:
+        return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    found = matcher.match(descriptors.view(np.uint8), features.descriptors.view(np.uint8))
+    rows = np.array([(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_distance], dtype=np.int64)
+    rows = rows.reshape(-1, 2)
+    return Matches(ids[rows[:, 0]], rows[:, 1])

@@ -1,0 +1,65 @@
+"""A pose from matches of which many may be wrong: random triples of 3D-3D matches, judged by reprojection."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.optimization import Array, Observations
+
+_NEAR = 0.05  # m
+_DEPTH_TOLERANCE = 0.1  # of the depth: a match whose measured depth is further off does not agree
+
+
+def rigid_transforms(source: Array, target: Array) -> Array:
+    """source, target: [h, k, 3] corresponding points, m. Returns [h, 4, 4] with target ~ T source (Kabsch)."""
+    from_mean, to_mean = source.mean(axis=1), target.mean(axis=1)
+    covariance = (target - to_mean[:, None]).transpose(0, 2, 1) @ (source - from_mean[:, None])
+    U, _, Vt = np.linalg.svd(covariance)
+    turn = np.ones((len(source), 3))
+    turn[:, 2] = np.sign(np.linalg.det(U @ Vt))
+    result = np.zeros((len(source), 4, 4))
+    result[:, :3, :3] = (U * turn[:, None, :]) @ Vt
+    result[:, :3, 3] = to_mean - np.einsum("hij,hj->hi", result[:, :3, :3], from_mean)
+    result[:, 3, 3] = 1.0
+    return result
+
+
+def ransac_pose(
+    points: Array,
+    seen: Observations,
+    camera: Camera,
+    rng: np.random.Generator,
+    hypotheses: int = 64,
+    tolerance: float = 3.0,
+    guess: Array | None = None,
+) -> tuple[Array, NDArray[np.bool_]] | None:
+    """The pose most matches agree with.
+
+    points: [m, 3] world, m; seen: what the camera measured of them; tolerance: px at pyramid level 0; guess: [4, 4]
+    T_cw that competes with the random hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer than three
+    matches that have depth and no guess.
+    """
+    poses = [] if guess is None else [guess[None]]
+    with_depth = np.flatnonzero(~np.isnan(seen.depths))
+    if len(with_depth) >= 3:
+        # Three different rows of each line of random numbers: the places of its three smallest.
+        triples = with_depth[np.argpartition(rng.random((hypotheses, len(with_depth))), 2, axis=1)[:, :3]]
+        local = camera.backproject(seen.pixels, seen.depths)
+        poses.append(rigid_transforms(points[triples], local[triples]))
+    if not poses:
+        return None
+    candidates = np.concatenate(poses)
+    agree = _agreement(candidates, points, seen, camera, tolerance)
+    best = int(np.argmax(agree.sum(axis=1)))
+    return candidates[best], agree[best]
+
+
+def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera, tolerance: float) -> NDArray[np.bool_]:
+    """[h, m] whether a match agrees with a hypothesis, in pixels and, where measured, in depth."""
+    local = points[None] @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    z = np.maximum(local[..., 2], _NEAR)
+    error_u = camera.fx * local[..., 0] / z + camera.cx - seen.pixels[:, 0]
+    error_v = camera.fy * local[..., 1] / z + camera.cy - seen.pixels[:, 1]
+    agree = error_u**2 + error_v**2 <= (tolerance * seen.sigmas) ** 2
+    agree &= ~(np.abs(local[..., 2] - seen.depths) > _DEPTH_TOLERANCE * z)  # a depth of nan disagrees with nothing
+    return np.asarray(agree & (local[..., 2] > _NEAR))

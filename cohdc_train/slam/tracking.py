@@ -1,0 +1,199 @@
+"""The tracker: every frame's pose against the map; decides on keyframes; finds the place again after a loss."""
+
+import time
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.features import FeatureExtractor, Features
+from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.mapping import insert_keyframe
+from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
+from cohdc_train.slam.optimization import Array, Weighing, optimize_pose
+from cohdc_train.slam.ransac import ransac_pose
+
+_MIN_START = 50  # points a first keyframe needs
+_MIN_FIRST = 15  # inliers of the first, rough pose
+_MIN_TRACKED = 25  # inliers of the pose against the local map
+_MIN_FOUND_AGAIN = 40  # the same when the place was lost
+_LOCAL_KEYFRAMES = 15
+_KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
+_KEYFRAME_FRAMES = 20
+_CANDIDATES = 6  # keyframes tried per lost frame
+
+
+@dataclass(frozen=True)
+class Pose:
+    """What became of one frame. t: s; T_wc: [4, 4] camera to world, m, None when the place is lost."""
+
+    t: float
+    T_wc: Array | None
+    keyframe: bool
+    inliers: int
+    track_ms: float
+    map_ms: float
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the frame has a pose."""
+        return self.T_wc is not None
+
+
+@dataclass(frozen=True)
+class _Fit:
+    T_cw: Array
+    matches: Matches
+
+
+class Tracker:
+    """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit."""
+
+    def __init__(self, camera: Camera, features: int = 1000, seed: int = 0) -> None:
+        self.camera = camera
+        self.map = Map(camera)
+        self.features: Features | None = None  # of the latest frame
+        self._extract = FeatureExtractor(camera, features)
+        self._weighing = Weighing(camera)
+        self._rng = np.random.default_rng(seed)
+        self._velocity = np.eye(4)
+        self._last: _Fit | None = None
+        self._reference: Keyframe | None = None
+        self._reference_inliers = 0
+        self._since_keyframe = 0
+        self._log: list[tuple[float, Keyframe, Array]] = []  # stamp, reference keyframe, T of the frame in it
+
+    def track(
+        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], t: float, mask: NDArray[np.bool_] | None = None
+    ) -> Pose:
+        """Find the camera of the next frame.
+
+        rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, 0 = no reading; t: s, rising;
+        mask: [H, W] bool, True = dynamic: nothing is taken from there.
+        """
+        start = time.perf_counter()
+        features = self._extract(rgb, depth_m, mask)
+        self.features = features
+        fit = self._locate(features, rgb)
+        tracked = time.perf_counter()
+        keyframe = fit is not None and self._wants_keyframe(features, fit)
+        if fit is not None and keyframe:
+            fit = self._add_keyframe(features, fit, t, rgb)
+        self._remember(fit, t)
+        inliers = 0 if fit is None else len(fit.matches)
+        mapped = time.perf_counter()
+        T_wc = None if fit is None else np.linalg.inv(fit.T_cw)
+        return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
+
+    def trajectory(self) -> tuple[Array, Array]:
+        """All tracked frames, each re-derived from its reference keyframe as the map has it now.
+
+        Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
+        """
+        stamps = np.array([t for t, _, _ in self._log])
+        poses = [np.linalg.inv(relative @ keyframe.T_cw) for _, keyframe, relative in self._log]
+        return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
+
+    def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> _Fit | None:
+        if not self.map.keyframes:
+            usable = np.count_nonzero(~np.isnan(features.depths))
+            empty = np.zeros(0, dtype=np.int64)
+            return _Fit(np.eye(4), Matches(empty, empty)) if usable >= _MIN_START else None
+        if self._last is None:
+            return self._relocalise(features, rgb)
+        rough = self._follow(features, self._last)
+        if rough is None:
+            return self._relocalise(features, rgb)
+        return self._against_local_map(features, rough, _MIN_TRACKED)
+
+    def _follow(self, features: Features, last: _Fit) -> _Fit | None:
+        """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
+        for guess, radius in ((self._velocity @ last.T_cw, 15.0), (last.T_cw, 40.0)):
+            projected = self.map.project(last.matches.points, guess)
+            matches = match_projected(projected, features, radius)
+            fit = self._solve(features, matches, guess, hypotheses=64)
+            if fit is not None:
+                return fit
+        return None
+
+    def _solve(self, features: Features, matches: Matches, guess: Array | None, hypotheses: int) -> _Fit | None:
+        if len(matches) < _MIN_FIRST:
+            return None
+        points, seen = self.map.positions[matches.points], observations(features, matches.corners)
+        found = ransac_pose(points, seen, self.camera, self._rng, hypotheses, guess=guess)
+        if found is None or found[1].sum() < _MIN_FIRST:
+            return None
+        T_cw, agree = found
+        matches = matches.take(agree)
+        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing)
+        return _Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
+
+    def _against_local_map(self, features: Features, rough: _Fit, minimum: int) -> _Fit | None:
+        """The final pose, from all points of the keyframes around."""
+        keyframes = self.map.covisible(rough.matches.points, _LOCAL_KEYFRAMES)
+        projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
+        matches = match_projected(projected, features, radius=5.0)
+        points, seen = self.map.positions[matches.points], observations(features, matches.corners)
+        T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
+        if inlier.sum() < minimum:
+            return None
+        matches = matches.take(inlier)
+        self.map.visible[projected.ids] += 1
+        self.map.found[matches.points] += 1
+        best = self.map.covisible(matches.points, 1)
+        self._reference = best[0]
+        return _Fit(T_cw, matches)
+
+    def _relocalise(self, features: Features, rgb: NDArray[np.uint8]) -> _Fit | None:
+        """Try the keyframes that look most like the frame, and the newest."""
+        picture = thumbnail(rgb)
+        likeness = np.array([float((k.thumbnail * picture).sum()) for k in self.map.keyframes])
+        order = [*np.argsort(-likeness, kind="stable")[: _CANDIDATES - 1], len(likeness) - 1]
+        for index in dict.fromkeys(int(i) for i in order):
+            ids = self.map.keyframes[index].seen_points()
+            matches = match_descriptors(ids, self.map.descriptors[ids], features)
+            rough = self._solve(features, matches, None, hypotheses=256)
+            fit = None if rough is None else self._against_local_map(features, rough, _MIN_FOUND_AGAIN)
+            if fit is not None:
+                return fit
+        return None
+
+    def _wants_keyframe(self, features: Features, fit: _Fit) -> bool:
+        if not self.map.keyframes:
+            return True
+        if self._since_keyframe >= _KEYFRAME_FRAMES:
+            return True
+        return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
+
+    def _add_keyframe(self, features: Features, fit: _Fit, t: float, rgb: NDArray[np.uint8]) -> _Fit:
+        point_ids = np.full(len(features), -1)
+        point_ids[fit.matches.corners] = fit.matches.points
+        keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, thumbnail(rgb))
+        insert_keyframe(self.map, keyframe, self._weighing)
+        self._reference = keyframe
+        self._since_keyframe = 0
+        self._reference_inliers = 0
+        corners = np.flatnonzero(keyframe.point_ids >= 0)
+        return _Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners))
+
+    def _remember(self, fit: _Fit | None, t: float) -> None:
+        if fit is None or self._reference is None:
+            self._last = None
+            self._velocity = np.eye(4)
+            return
+        self._velocity = np.eye(4) if self._last is None else fit.T_cw @ np.linalg.inv(self._last.T_cw)
+        self._last = fit
+        if self._since_keyframe > 0:
+            self._reference_inliers = max(self._reference_inliers, len(fit.matches))
+        self._since_keyframe += 1
+        self._log.append((t, self._reference, fit.T_cw @ np.linalg.inv(self._reference.T_cw)))
+
+
+def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[30, 40] float32, blurred, zero mean and unit norm: the product of two is their normalised correlation."""
+    small = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (40, 30), interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5)
+    image -= image.mean()
+    return np.asarray(image / (np.linalg.norm(image) + 1e-6), dtype=np.float32)

@@ -1,0 +1,151 @@
+"""A sequence folder in the layout of the TUM RGB-D benchmark: rgb.txt and depth.txt, paired by nearest time stamp."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.errors import DataError
+from cohdc_train.slam.camera import Camera
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One associated pair; `t` is the colour image's stamp, s."""
+
+    t: float
+    stamp: str
+    rgb: Path
+    depth: Path
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """frames in the order of time; `without_depth`: how many colour images found no depth image near enough."""
+
+    folder: Path
+    frames: tuple[Frame, ...]
+    without_depth: int
+
+    @property
+    def groundtruth(self) -> Path | None:
+        """groundtruth.txt when the folder has one."""
+        path = self.folder / "groundtruth.txt"
+        return path if path.is_file() else None
+
+
+@dataclass(frozen=True)
+class _Entry:
+    t: float
+    stamp: str
+    name: str
+
+
+def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
+    """Read the two lists and pair them one to one, nearest stamps first, as TUM's associate tool does.
+
+    max_difference: s. Raises DataError naming file and line for a missing or broken list, or when nothing pairs.
+    """
+    colours = _read_list(folder / "rgb.txt")
+    depths = _read_list(folder / "depth.txt")
+    times = np.array([entry.t for entry in colours]), np.array([entry.t for entry in depths])
+    pairs = pair_stamps(times[0], times[1], max_difference)
+    if not pairs:
+        raise DataError(f"{folder}: no image of rgb.txt lies within {max_difference:g} s of one of depth.txt")
+    frames = tuple(
+        Frame(colours[i].t, colours[i].stamp, folder / colours[i].name, folder / depths[j].name) for i, j in pairs
+    )
+    return Sequence(folder, frames, len(colours) - len(frames))
+
+
+def pair_stamps(
+    first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
+) -> list[tuple[int, int]]:
+    """One-to-one pairs of indices, smallest difference first, sorted by the first; all stamps in s."""
+    if len(second) == 0:
+        return []
+    order = np.argsort(second, kind="stable")
+    stamps = second[order]
+    low = np.searchsorted(stamps, first - max_difference, side="left")
+    high = np.searchsorted(stamps, first + max_difference, side="right")
+    candidates = [
+        (abs(float(first[i] - second[j])), i, int(j)) for i in range(len(first)) for j in order[low[i] : high[i]]
+    ]
+    taken_first: set[int] = set()
+    taken_second: set[int] = set()
+    pairs: list[tuple[int, int]] = []
+    for _, i, j in sorted(candidates):
+        if i not in taken_first and j not in taken_second:
+            taken_first.add(i)
+            taken_second.add(j)
+            pairs.append((i, j))
+    return sorted(pairs, key=lambda pair: first[pair[0]])
+
+
+def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """[height, width, 3] uint8 RGB. Raises DataError when the file is missing, broken or of another size."""
+    image = _decode(path, cv2.IMREAD_COLOR)
+    _check_size(path, image.shape[:2], camera)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
+    """[height, width] m, 0 = no reading. Raises DataError unless it is a 16 bit image of the camera's size."""
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise DataError(f"{path}: depth must be one channel of 16 bit, not {image.dtype} of shape {image.shape}")
+    _check_size(path, image.shape, camera)
+    return image.astype(np.float32) / np.float32(camera.depth_scale)
+
+
+def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
+    """[height, width] bool, True = dynamic (any value above 0 in the file). Raises DataError as read_rgb does."""
+    image = _decode(path, cv2.IMREAD_GRAYSCALE)
+    _check_size(path, image.shape, camera)
+    return np.asarray(image > 0)
+
+
+def _decode(path: Path, flags: int) -> NDArray[np.generic]:
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise DataError(f"{path}: not an image that can be decoded ({len(data)} bytes)")
+    return np.asarray(image)
+
+
+def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
+    if tuple(shape) != (camera.height, camera.width):
+        found, expected = f"{shape[1]}x{shape[0]}", f"{camera.width}x{camera.height}"
+        raise DataError(f"{path}: image is {found}, the camera says {expected}")
+
+
+def _read_list(path: Path) -> list[_Entry]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read; a TUM sequence has rgb.txt and depth.txt ({error})") from error
+    entries: list[_Entry] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) != 2:
+            raise DataError(f"{path}:{number}: expected 'timestamp filename', found {len(words)} words")
+        try:
+            stamp = float(words[0])
+        except ValueError as error:
+            raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not a number") from error
+        if not math.isfinite(stamp):
+            raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not finite")
+        if not (path.parent / words[1]).is_file():
+            raise DataError(f"{path}:{number}: {words[1]} does not exist in {path.parent}")
+        entries.append(_Entry(stamp, words[0], words[1]))
+    if not entries:
+        raise DataError(f"{path}: lists no image")
+    return entries
