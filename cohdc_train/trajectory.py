@@ -47,10 +47,9 @@ class Trajectory:
             raise ValueError(f"stamps fall after index {int(np.argmax(np.diff(stamps) < 0))}")
         rotations = poses[:, :3, :3]
         gram = rotations.transpose(0, 2, 1) @ rotations
-        if not (np.allclose(gram, np.eye(3), atol=1e-5) and (np.linalg.det(rotations) > 0).all()):
-            raise ValueError("a pose does not hold a rotation")
-        if not np.array_equal(poses[:, 3], np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(stamps), 4))):
-            raise ValueError("a pose's last row is not 0 0 0 1")
+        rigid = np.allclose(gram, np.eye(3), atol=1e-5) and (np.linalg.det(rotations) > 0).all()
+        if not rigid or (poses[:, 3] != (0, 0, 0, 1)).any():
+            raise ValueError("a pose is not a rotation and a translation over the row 0 0 0 1")
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -135,8 +134,8 @@ def _write_text(path: Path, text: str) -> None:
 def associate(a: FloatArray, b: FloatArray, max_difference: float = 0.02) -> NDArray[np.int64]:
     """Pairs of stamps at most `max_difference` s apart, each stamp used once, the nearest pairs chosen first.
 
-    a: [n], b: [m], strictly increasing, s. Returns [k, 2] indices into a and b, both columns increasing. The rule is that
-    of the TUM benchmark's associate tool, except that two pairs which would cross in time are uncrossed.
+    a: [n], b: [m], strictly increasing, s. Returns [k, 2] indices into a and b, both columns increasing. The rule is
+    that of the TUM benchmark's associate tool, except that two pairs which would cross in time are uncrossed.
     """
     first = np.searchsorted(b, a - max_difference, side="left")
     counts = np.searchsorted(b, a + max_difference, side="right") - first
@@ -166,9 +165,7 @@ def match(groundtruth: Trajectory, estimate: Trajectory, max_difference: float =
     partner = partner[stamp_of_row]
     matched = np.flatnonzero(partner >= 0)
     if len(matched) < 3:
-        raise DataError(
-            f"only {len(matched)} of {len(estimate)} estimated poses lie within {max_difference} s of the ground truth"
-        )
+        raise DataError(f"{len(matched)} of {len(estimate)} poses lie within {max_difference} s of the ground truth")
     return groundtruth.take(partner[matched]), estimate.take(matched)
 
 
@@ -275,9 +272,9 @@ def evaluate(
 ) -> dict[str, object]:
     """Score an estimated trajectory against ground truth; both are TUM text files.
 
-    Prints ATE (rigid alignment, no scale), RPE over 1 s and RPE over all pairs, six statistics each, and returns them
-    with `coverage` (share of ground-truth poses with an estimate within 0.05 s) and `pairs` (matched poses).
-    Raises DataError naming the file and line that cannot be used.
+    Prints and returns ATE (rigid alignment, no scale), RPE over 1 s and RPE over all pairs, six statistics each,
+    `coverage` (share of ground-truth poses with an estimate within 0.05 s) and `pairs` (matched poses).
+    Raises DataError naming the file, and the line, that cannot be used.
 
     Args:
         groundtruth: TUM file of the true trajectory.
@@ -292,17 +289,11 @@ def evaluate(
         raise DataError(f"{estimate}: {error}") from error
     pairs = len(match(truth, guess, max_difference)[0])
     result: dict[str, object] = {**scores, "coverage": coverage(truth, guess), "pairs": pairs}
-    print(table(scores))
+    print(f"{'':<16}" + "".join(f"{name:>10}" for name in scores["ate_m"]))
+    for key, row in scores.items():
+        print(f"{key:<16}" + "".join(f"{value:>10.4f}" for value in row.values()))
     print(f"pairs {pairs} of {len(guess)} estimated poses, coverage {100 * coverage(truth, guess):.1f} %")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         _write_text(out, json.dumps(result, indent=2) + "\n")
     return result
-
-
-def table(scores: Scores) -> str:
-    """Scores as lines of text: one row per score, one column per statistic."""
-    names = list(next(iter(scores.values())))
-    rows = [f"{'':<16}" + "".join(f"{name:>10}" for name in names)]
-    rows += [f"{key:<16}" + "".join(f"{row[name]:>10.4f}" for name in names) for key, row in scores.items()]
-    return "\n".join(rows)
