@@ -1,0 +1,141 @@
+"""One annotation and one image of a COCO-format file, checked (numpy, pycocotools, OpenCV; no torch)."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as rle
+
+from cohdc_train.errors import DataError
+
+_CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
+
+
+@dataclass(frozen=True)
+class CocoObject:
+    """One annotated object.
+
+    Attributes:
+        id: annotation id in the file.
+        label: 1..C.
+        box: x, y, width, height in px, clipped to the image.
+        area: px^2, as annotated.
+        segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE; empty for a crowd given by its box only.
+        crowd: a region of uncounted objects: ignored by losses and scores.
+    """
+
+    id: int
+    label: int
+    box: tuple[float, float, float, float]
+    area: float
+    segmentation: Any
+    crowd: bool
+
+    def mask(self, height: int, width: int) -> NDArray[np.uint8]:
+        """[height, width] uint8 of 0 and 1; what lies outside the image is cut off."""
+        if isinstance(self.segmentation, dict):
+            encoded = self.segmentation
+        else:
+            encoded = rle.merge(rle.frPyObjects(self.segmentation, height, width))
+        with warnings.catch_warnings():  # pycocotools 2.0.11 decodes under numpy 2 by a deprecated way
+            warnings.simplefilter("ignore", DeprecationWarning)
+            decoded: NDArray[np.uint8] = rle.decode(encoded)
+        return decoded
+
+
+@dataclass(frozen=True)
+class CocoImage:
+    """One image and its objects; an image without objects is kept, it teaches what is background."""
+
+    id: int
+    path: Path
+    height: int
+    width: int
+    objects: tuple[CocoObject, ...]
+
+
+def read_image(image: CocoImage) -> NDArray[np.uint8]:
+    """[height, width, 3] uint8 RGB. EXIF orientation is ignored, as COCO's annotations do.
+
+    Raises DataError naming file and id when it cannot be decoded or its size is not the annotated one.
+    """
+    pixels = cv2.imread(str(image.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise DataError(f"{image.path}: image {image.id} cannot be read as an image")
+    height, width = pixels.shape[:2]
+    if (height, width) != (image.height, image.width):
+        turned = ": annotated as shown turned by EXIF?" if (width, height) == (image.height, image.width) else ""
+        annotated = f"{image.width}x{image.height}"
+        raise DataError(f"{image.path}: image {image.id} is {width}x{height}, its annotation {annotated}{turned}")
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
+    """Polygons with at least three points, or a compressed RLE; empty when there is none."""
+    given = row.get("segmentation") or []
+    try:
+        if not isinstance(given, dict):
+            return [list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0]
+        if list(given["size"]) != [image.height, image.width]:
+            size = f"{image.height}x{image.width}"
+            raise DataError(f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}")
+        if isinstance(given["counts"], list):
+            if sum(given["counts"]) != image.height * image.width:
+                raise ValueError("RLE counts")
+            given = rle.frPyObjects(given, image.height, image.width)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: annotation {row.get('id')}: neither polygons nor RLE") from error
+    counts = given["counts"]
+    return {"size": list(given["size"]), "counts": counts.decode() if isinstance(counts, bytes) else counts}
+
+
+def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
+    """Why an annotation cannot be used; empty when it can."""
+    box = row.get("bbox")
+    if box is not None and (len(box) != 4 or not _has_extent(_clip(box, image))):
+        return "degenerate box"
+    if not segmentation:
+        return "" if row.get("iscrowd") and box is not None else "no contour"
+    return "" if _has_extent(_clip(_extent(segmentation), image)) else "degenerate contour"
+
+
+def build_object(row: dict[str, Any], label: int, segmentation: Any, image: CocoImage) -> CocoObject:
+    """The object of a sound annotation; a missing box is taken from the contour."""
+    box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
+    area = float(row.get("area") or box[2] * box[3])
+    return CocoObject(int(row.get("id", 0)), label, box, area, segmentation, bool(row.get("iscrowd", 0)))
+
+
+def _extent(segmentation: Any) -> tuple[float, float, float, float]:
+    """x, y, width, height of a segmentation."""
+    if isinstance(segmentation, dict):
+        x, y, width, height = (float(v) for v in rle.toBbox(segmentation))
+        return x, y, width, height
+    points = np.concatenate([np.asarray(part).reshape(-1, 2) for part in segmentation])
+    low, high = points.min(axis=0), points.max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
+
+
+def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, float]:
+    x0, y0 = max(float(box[0]), 0.0), max(float(box[1]), 0.0)
+    x1, y1 = min(float(box[0]) + float(box[2]), image.width), min(float(box[1]) + float(box[3]), image.height)
+    return x0, y0, x1 - x0, y1 - y0
+
+
+def _has_extent(box: Sequence[float]) -> bool:
+    return box[2] > 0 and box[3] > 0
+
+
+def reaches_out(box: Sequence[float] | None, image: CocoImage) -> bool:
+    """Whether an annotated box leaves the image by more than the tolerance."""
+    if box is None:
+        return False
+    inside = _clip(box, image)
+    return max(abs(inside[0] - box[0]), abs(inside[1] - box[1])) > _CLIP_TOLERANCE or (
+        max(box[2] - inside[2], box[3] - inside[3]) > _CLIP_TOLERANCE
+    )

@@ -1,0 +1,184 @@
+"""COCO-format annotations -> checked objects with labels 1..C (no torch).
+
+Numbers of classes are read, never typed: category ids are remapped through `categories`, sorted by id, to 1..C.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cohdc_train.data.annotations import CocoImage, CocoObject, build_object, defect, reaches_out, read_segmentation
+from cohdc_train.data.layout import CocoPaths, SplitPaths, find_split, read_json
+from cohdc_train.errors import DataError
+
+
+@dataclass(frozen=True)
+class CocoSplit:
+    """One split, ready to train on or to score against.
+
+    Attributes:
+        name: "train" or "val".
+        annotations: the file it was read from.
+        class_names: name of label i + 1 at index i.
+        images: sorted by id.
+        dropped: number of annotations left out, by reason.
+        clipped: number of annotations that reached more than 1 px out of their image.
+    """
+
+    name: str
+    annotations: Path
+    class_names: tuple[str, ...]
+    images: tuple[CocoImage, ...]
+    dropped: dict[str, int] = field(default_factory=dict)
+    clipped: int = 0
+
+    def relabelled(self, class_names: Sequence[str]) -> "CocoSplit":
+        """The same split under another order of the same names. Raises DataError when the names differ."""
+        if tuple(class_names) == self.class_names:
+            return self
+        if set(class_names) != set(self.class_names):
+            ours, theirs = ", ".join(self.class_names), ", ".join(class_names)
+            raise DataError(f"{self.annotations}: classes are {ours}; the training split's are {theirs}")
+        to = [class_names.index(name) + 1 for name in self.class_names]
+        images = tuple(
+            replace(image, objects=tuple(replace(o, label=to[o.label - 1]) for o in image.objects))
+            for image in self.images
+        )
+        return replace(self, class_names=tuple(class_names), images=images)
+
+    def subset(self, count: int | None) -> "CocoSplit":
+        """`count` images drawn at random, always the same ones; a larger subset holds the smaller. None keeps all.
+
+        Raises DataError when there are fewer.
+        """
+        if count is None:
+            return self
+        if not 0 < count <= len(self.images):
+            raise DataError(f"{self.annotations}: {count} {self.name} images asked for, {len(self.images)} there")
+        chosen = sorted(np.random.default_rng(0).permutation(len(self.images))[:count])
+        return replace(self, images=tuple(self.images[i] for i in chosen))
+
+    def ground_truth(self) -> dict[str, Any]:
+        """The split as a COCO dict of its kept objects, category ids 1..C: what the scores are measured against."""
+        categories = [{"id": i + 1, "name": name} for i, name in enumerate(self.class_names)]
+        images = [{"id": image.id, "height": image.height, "width": image.width} for image in self.images]
+        annotations: list[dict[str, Any]] = []
+        for image in self.images:
+            for o in image.objects:
+                row = {"id": len(annotations) + 1, "image_id": image.id, "category_id": o.label, "bbox": list(o.box)}
+                shape = o.segmentation or _box_polygon(o.box)
+                annotations.append({**row, "area": o.area, "iscrowd": int(o.crowd), "segmentation": shape})
+        return {"images": images, "categories": categories, "annotations": annotations}
+
+
+@dataclass(frozen=True)
+class CocoFolder:
+    """Training splits (one per root) and the first root's validation split, under one class map."""
+
+    train: tuple[CocoSplit, ...]
+    val: CocoSplit
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Name of label i + 1 at index i."""
+        return self.val.class_names
+
+
+def read_folder(
+    roots: Sequence[Path], classes: Sequence[str] | None = None, paths: CocoPaths | None = None
+) -> CocoFolder:
+    """Training and validation data of one or several folders.
+
+    The class map is the first training split's; the other splits must have the same names after the filter, whatever
+    their ids. `paths` overrides the first root's places, or stands alone.
+    Raises DataError in one line naming file and id.
+    """
+    paths = paths or CocoPaths()
+    if not roots and (paths.train_json is None or paths.val_json is None):
+        raise DataError("no data: give data.root, or data.paths with train_json, train_images, val_json and val_images")
+    found = [paths.split("train") or find_split(roots[0], "train"), *(find_split(r, "train") for r in roots[1:])]
+    train = [read_split("train", files, classes) for files in found]
+    names = train[0].class_names
+    val = read_split("val", paths.split("val") or find_split(roots[0], "val"), classes)
+    return CocoFolder(tuple(split.relabelled(names) for split in train), val.relabelled(names))
+
+
+def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = None) -> CocoSplit:
+    """Read and check one annotation file.
+
+    Segmentations may be polygons, compressed or uncompressed RLE. Objects whose box or contour has no extent inside the
+    image are dropped and counted, and so are boxes without a contour.
+    Raises DataError naming the file and the image, annotation or class that cannot be used.
+    """
+    content = read_json(files.annotations)
+    names, labels = _class_map(files.annotations, content["categories"], classes)
+    images = {image.id: image for image in (_read_image(files, row) for row in content["images"])}
+    if len(images) != len(content["images"]):
+        raise DataError(f"{files.annotations}: {len(content['images']) - len(images)} image ids are used twice")
+    objects: dict[int, list[CocoObject]] = {image_id: [] for image_id in images}
+    dropped: Counter[str] = Counter()
+    clipped = 0
+    for row in content["annotations"]:
+        image, label = _references(files.annotations, row, images, labels)
+        if label == 0:
+            continue
+        segmentation = read_segmentation(files.annotations, row, image)
+        reason = defect(row, segmentation, image)
+        if reason:
+            dropped[reason] += 1
+            continue
+        clipped += reaches_out(row.get("bbox"), image)
+        objects[image.id].append(build_object(row, label, segmentation, image))
+    kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
+    if not any(o for image in kept for o in image.objects if not o.crowd):
+        raise DataError(f"{files.annotations}: no object to learn: {dict(dropped) or 'no annotation of these classes'}")
+    return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped)
+
+
+def _class_map(
+    path: Path, categories: list[dict[str, Any]], classes: Sequence[str] | None
+) -> tuple[tuple[str, ...], dict[int, int]]:
+    """Class names in label order, and category id -> label (0: filtered away)."""
+    try:
+        known = dict(sorted((int(row["id"]), str(row["name"])) for row in categories))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: a category without a numeric id and a name") from error
+    if len(known) != len(categories) or len(set(known.values())) != len(known):
+        raise DataError(f"{path}: categories with the same id or name")
+    unknown = [name for name in classes or () if name not in known.values()]
+    if unknown:
+        raise DataError(f"{path}: no class {unknown[0]!r}; it has {', '.join(known.values())}")
+    names = tuple(name for name in known.values() if classes is None or name in classes)
+    if not names:
+        raise DataError(f"{path}: no class at all")
+    return names, {i: names.index(name) + 1 if name in names else 0 for i, name in known.items()}
+
+
+def _read_image(files: SplitPaths, row: dict[str, Any]) -> CocoImage:
+    try:
+        image_id, height, width = int(row["id"]), int(row["height"]), int(row["width"])
+        path = files.images / str(row["file_name"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{files.annotations}: image {row}: needs id, file_name, height and width") from error
+    if not path.is_file():
+        raise DataError(f"{files.annotations}: image {image_id}: {path} does not exist")
+    return CocoImage(image_id, path, height, width, ())
+
+
+def _references(
+    path: Path, row: dict[str, Any], images: dict[int, CocoImage], labels: dict[int, int]
+) -> tuple[CocoImage, int]:
+    """The image and the label an annotation points at."""
+    for key, known in (("image_id", images), ("category_id", labels)):
+        if row.get(key) not in known:
+            raise DataError(f"{path}: annotation {row.get('id')}: {key} {row.get(key)} is not in the file")
+    return images[row["image_id"]], labels[row["category_id"]]
+
+
+def _box_polygon(box: Sequence[float]) -> list[list[float]]:
+    x, y, width, height = box
+    return [[x, y, x + width, y, x + width, y + height, x, y + height]]

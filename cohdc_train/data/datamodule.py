@@ -1,0 +1,226 @@
+"""COCO-format folders -> batches for the trainer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import cv2
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+from torch.utils.data import ConcatDataset, DataLoader, Dataset
+from torchvision import tv_tensors
+
+from cohdc_train.data.annotations import read_image
+from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder
+from cohdc_train.data.layout import CocoPaths
+from cohdc_train.data.transforms import (
+    Augmentation,
+    blank_padding,
+    mask_boxes,
+    photometric_augmentation,
+    training_transform,
+)
+
+Target = dict[str, Any]
+ValSample = tuple[Tensor, int]
+_AUGMENTATION = Augmentation()
+
+
+@dataclass(frozen=True)
+class Subset:
+    """How many images of each split to use, drawn at random but always the same ones; None uses all.
+
+    Attributes:
+        train: training images of every root.
+        val: validation images.
+    """
+
+    train: int | None = None
+    val: int | None = None
+
+
+_EVERYTHING = Subset()
+
+
+class TrainBatch(NamedTuple):
+    """One training batch.
+
+    images: [B, 3, H, W] on the canvas; uint8 from the loader, float32 in 0..1 after the transfer to the device.
+    targets: per image `boxes` [n, 4] xyxy px, `labels` int64 [n] from 1, `masks` uint8 [n, H, W], `ignore` [k, 4] the
+    crowd's boxes, `image_id`, and `size`: (height, width) of the content on the canvas; the rest is padding.
+    """
+
+    images: Tensor
+    targets: list[Target]
+
+
+class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
+    """Augmented training images on the canvas, with boxes recomputed from what is left of the masks."""
+
+    def __init__(self, split: CocoSplit, canvas: tuple[int, int], augment: Augmentation) -> None:
+        self.split = split
+        self.transform = training_transform(canvas, augment)
+
+    def __len__(self) -> int:
+        return len(self.split.images)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Target]:
+        """uint8 [3, H, W] and its target. Raises DataError naming an image that cannot be read."""
+        image = self.split.images[index]
+        size = (image.height, image.width)
+        objects = [o for o in image.objects if not o.crowd]
+        crowd = torch.tensor([o.box for o in image.objects if o.crowd], dtype=torch.float32).reshape(-1, 4)
+        crowd[:, 2:] += crowd[:, :2]
+        masks = torch.zeros((len(objects), *size), dtype=torch.uint8)
+        for mask, o in zip(masks, objects, strict=True):
+            mask.copy_(torch.from_numpy(o.mask(*size)))
+        sample = {
+            "image": tv_tensors.Image(torch.from_numpy(read_image(image)).permute(2, 0, 1)),
+            "content": tv_tensors.Mask(torch.ones((1, *size), dtype=torch.uint8)),
+            "masks": tv_tensors.Mask(masks),
+            "ignore": tv_tensors.BoundingBoxes(crowd, format="XYXY", canvas_size=size),
+        }
+        labels = torch.tensor([o.label for o in objects], dtype=torch.int64)
+        out = {name: value.as_subclass(Tensor) for name, value in self.transform(sample).items()}
+        return out["image"], _target(out, labels, image.id)
+
+
+class CocoValSet(Dataset[ValSample]):
+    """Validation images as they are on disk."""
+
+    def __init__(self, split: CocoSplit) -> None:
+        self.split = split
+
+    def __len__(self) -> int:
+        return len(self.split.images)
+
+    def __getitem__(self, index: int) -> ValSample:
+        """uint8 [3, height, width] RGB at the image's own size, and the image id."""
+        image = self.split.images[index]
+        return torch.from_numpy(read_image(image)).permute(2, 0, 1).contiguous(), image.id
+
+
+class CocoDataModule(pl.LightningDataModule):
+    """Training and validation batches from COCO-format folders of any usual layout.
+
+    Validation is on the first root's val split. Several roots train together when they have the same class names after
+    the filter, whatever their ids.
+
+    Args:
+        root: the folder, or several.
+        classes: use these classes only; None uses all of them.
+        canvas: (height, width) in px every training image is fitted into; the network takes it over.
+        batch_size: images per batch and device.
+        workers: processes that read images; 0 reads them in the trainer's own.
+        augment: what training images go through.
+        subset: how many images of each split to use.
+        paths: annotation files and image folders, where the layout is an unusual one.
+
+    Raises:
+        DataError: an annotation file or an image cannot be used; one line names it.
+    """
+
+    def __init__(
+        self,
+        root: Path | list[Path] | None = None,
+        classes: list[str] | None = None,
+        canvas: tuple[int, int] = (800, 1024),
+        batch_size: int = 2,
+        workers: int = 1,
+        augment: Augmentation = _AUGMENTATION,
+        subset: Subset = _EVERYTHING,
+        paths: CocoPaths | None = None,
+    ) -> None:
+        super().__init__()
+        self.roots = [Path(r) for r in root] if isinstance(root, list) else [] if root is None else [Path(root)]
+        self.classes = classes
+        self.canvas = canvas
+        self.batch_size = batch_size
+        self.workers = workers
+        self.augment = augment
+        self.subset = subset
+        self.paths = paths
+        self._folder: CocoFolder | None = None
+        self._photometric = photometric_augmentation() if augment.photometric else None
+
+    @property
+    def folder(self) -> CocoFolder:
+        """The checked annotations, read at the first use."""
+        if self._folder is None:
+            whole = read_folder(self.roots, self.classes, self.paths)
+            train = tuple(split.subset(self.subset.train) for split in whole.train)
+            self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
+        return self._folder
+
+    @property
+    def class_names(self) -> list[str]:
+        """Name of label i + 1 at index i."""
+        return list(self.folder.class_names)
+
+    @property
+    def num_classes(self) -> int:
+        """Classes without background."""
+        return len(self.folder.class_names)
+
+    def val_ground_truth(self) -> dict[str, Any]:
+        """The validation split as a COCO dict with category ids 1..C."""
+        return self.folder.val.ground_truth()
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Shuffled batches of `TrainBatch`; the order and every draw follow torch's seed."""
+        sets = [CocoTrainSet(split, self.canvas, self.augment) for split in self.folder.train]
+        return self._loader(ConcatDataset(sets), shuffle=True, collate=_collate_train)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Batches [(image uint8 [3, height, width], image id), ...]."""
+        return self._loader(CocoValSet(self.folder.val), shuffle=False, collate=list)
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """Training images to float32 in 0..1, unless switched off with kornia's photometry; padding stays 0."""
+        if not isinstance(batch, TrainBatch):
+            return batch
+        images = batch.images.float() / 255
+        if self._photometric is not None:
+            with torch.autocast(images.device.type, enabled=False):
+                images = cast(Tensor, self._photometric(images)).clamp(0, 1)
+            images = blank_padding(images, [target["size"] for target in batch.targets])
+        return TrainBatch(images, batch.targets)
+
+    def _loader(self, dataset: Dataset[Any], shuffle: bool, collate: Any) -> DataLoader[Any]:
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            shuffle=shuffle,
+            num_workers=self.workers,
+            collate_fn=collate,
+            worker_init_fn=_start_worker,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.workers > 0,
+        )
+
+
+def _target(out: dict[str, Tensor], labels: Tensor, image_id: int) -> Target:
+    """What is left after the transform: objects with a visible pixel, crowd boxes with an area."""
+    boxes = mask_boxes(out["masks"])
+    kept = boxes[:, 2] > boxes[:, 0]
+    ignore = out["ignore"]
+    ignore = ignore[(ignore[:, 2] > ignore[:, 0]) & (ignore[:, 3] > ignore[:, 1])]
+    content = mask_boxes(out["content"])[0]
+    return {
+        "boxes": boxes[kept],
+        "labels": labels[kept],
+        "masks": out["masks"][kept],
+        "ignore": ignore,
+        "image_id": image_id,
+        "size": (int(content[3]), int(content[2])),
+    }
+
+
+def _collate_train(samples: Sequence[tuple[Tensor, Target]]) -> TrainBatch:
+    return TrainBatch(torch.stack([image for image, _ in samples]), [target for _, target in samples])
+
+
+def _start_worker(worker: int) -> None:
+    cv2.setNumThreads(0)  # OpenCV's threads in every worker would fight for the cores
