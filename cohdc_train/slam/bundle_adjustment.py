@@ -47,7 +47,7 @@ class _Normal:
 
     camera: Array  # [c, 6, 6]
     point: Array  # [p, 3, 3]
-    mixed: Array  # [p, c, 6, 3]
+    mixed: Array  # [3, c * 6, p]: columns of the point's block first, so that products are long and contiguous
     camera_gradient: Array  # [c, 6]
     point_gradient: Array  # [p, 3]
 
@@ -109,46 +109,53 @@ def _normal_equations(poses: Array, points: Array, problem: Problem, weighing: W
         weight = np.sqrt(huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.limits))
         error, derivative = error * weight[:, None], derivative * weight[:, None, None]
     by_pose = pose_jacobian(local, derivative)
-    by_point = derivative @ poses[problem.cameras, :3, :3]
-    blocks = by_point.transpose(0, 2, 1) @ by_point
-    slopes = np.einsum("mij,mi->mj", by_point, error)
-    free = np.flatnonzero(problem.free)
-    count = len(points)
+    free, count = np.flatnonzero(problem.free), len(points)
+    slot = {int(camera): place for place, camera in enumerate(free)}
     result = _Normal(
-        np.zeros((len(free), 6, 6)), np.zeros((count, 3, 3)), np.zeros((count, len(free), 6, 3)),
-        np.zeros((len(free), 6)), np.zeros((count, 3)),
-    )  # fmt: skip
+        camera=np.zeros((len(free), 6, 6)),
+        point=np.zeros((count, 3, 3)),
+        mixed=np.zeros((3, len(free) * 6, count)),
+        camera_gradient=np.zeros((len(free), 6)),
+        point_gradient=np.zeros((count, 3)),
+    )
     ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
-    for camera in range(len(poses)):  # within one camera every point occurs once, so += may index with an array
+    for camera, pose in enumerate(poses):
         rows = slice(ends[camera], ends[camera + 1])
-        ids = problem.points[rows]
-        result.point[ids] += blocks[rows]
-        result.point_gradient[ids] += slopes[rows]
-    for slot, camera in enumerate(free):
-        rows = slice(ends[camera], ends[camera + 1])
-        J = by_pose[rows].reshape(-1, 6)
-        result.camera[slot] = J.T @ J
-        result.camera_gradient[slot] = J.T @ error[rows].reshape(-1)
-        result.mixed[problem.points[rows], slot] = by_pose[rows].transpose(0, 2, 1) @ by_point[rows]
+        by_point = (derivative[rows].reshape(-1, 3) @ pose[:3, :3]).reshape(-1, 3, 3)
+        ids = problem.points[rows]  # a camera sees a point once, so += may index with an array
+        result.point[ids] += by_point.transpose(0, 2, 1) @ by_point
+        result.point_gradient[ids] += np.einsum("mij,mi->mj", by_point, error[rows])
+        if camera in slot:
+            _add_camera(result, slot[camera], ids, (by_pose[rows], by_point, error[rows]))
     return result
+
+
+def _add_camera(result: _Normal, slot: int, ids: NDArray[np.int64], terms: tuple[Array, Array, Array]) -> None:
+    by_pose, by_point, error = terms
+    J = by_pose.reshape(-1, 6)
+    result.camera[slot] = J.T @ J
+    result.camera_gradient[slot] = J.T @ error.reshape(-1)
+    products = by_pose.transpose(0, 2, 1) @ by_point
+    result.mixed[:, slot * 6 : slot * 6 + 6, ids] = products.transpose(2, 1, 0)
 
 
 def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     """Steps of the poses [c, 6] and the points [p, 3] from the damped normal equations."""
-    c, p = len(normal.camera), len(normal.point)
+    c, mixed = len(normal.camera), normal.mixed
     diagonal = np.arange(3)
     point = normal.point.copy()
     point[:, diagonal, diagonal] = point[:, diagonal, diagonal] * (1 + damping) + 1e-6
     inverse = np.linalg.inv(point)
-    mixed = normal.mixed.reshape(p, c * 6, 3)
-    carried = mixed @ inverse
-    flat = np.ascontiguousarray(mixed.transpose(1, 0, 2)).reshape(c * 6, p * 3)
-    reduced = -(np.ascontiguousarray(carried.transpose(1, 0, 2)).reshape(c * 6, p * 3) @ flat.T)
+    right = -normal.camera_gradient.reshape(-1)
+    reduced = np.zeros((c * 6, c * 6))
+    for k in range(3):
+        carried = sum(mixed[i] * inverse[:, i, k] for i in range(3))  # column k of mixed @ inverse
+        reduced -= carried @ mixed[k].T
+        right = right + carried @ normal.point_gradient[:, k]
     for slot in range(c):
         block = slice(slot * 6, slot * 6 + 6)
         reduced[block, block] += normal.camera[slot] + damping * np.diag(np.diag(normal.camera[slot]))
-    right = -normal.camera_gradient.reshape(-1) + np.einsum("pij,pj->i", carried, normal.point_gradient)
     reduced[np.diag_indices(c * 6)] += 1e-9
     pose_step = np.linalg.solve(reduced, right)
-    back = -normal.point_gradient - (flat.T @ pose_step).reshape(p, 3)
+    back = -normal.point_gradient - np.stack([pose_step @ mixed[k] for k in range(3)], axis=1)
     return pose_step.reshape(c, 6), np.einsum("pij,pj->pi", inverse, back)

@@ -127,7 +127,7 @@ class Tracker:
             return None
         T_cw, agree = found
         matches = matches.take(agree)
-        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing)
+        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing, rounds=1)
         return _Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
 
     def _against_local_map(self, features: Features, rough: _Fit, minimum: int) -> _Fit | None:
