@@ -1,0 +1,8 @@
+"""Rendered data: COCO-format sets and TUM-format sequences of people walking in rooms. Importing it stays cheap."""
+
+from cohdc_train.synth.coco import coco
+from cohdc_train.synth.sequence import sequence
+
+COMMANDS = {"coco": coco, "sequence": sequence}
+
+__all__ = ["COMMANDS", "coco", "sequence"]

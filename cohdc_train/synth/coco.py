@@ -1,0 +1,191 @@
+"""`cohdc synth coco`: images of people in rooms with exact masks, as a COCO-format folder."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.errors import DataError
+from cohdc_train.synth import people as bodies
+from cohdc_train.synth.annotation import annotate
+from cohdc_train.synth.folder import new_folder
+from cohdc_train.synth.mesh import Floats, join
+from cohdc_train.synth.renderer import Atlas, Camera, render
+from cohdc_train.synth.scene import Lighting, Room, furnished_room
+from cohdc_train.synth.sensor import exposure, photograph, smear
+from cohdc_train.synth.streams import stream
+
+IMAGES_PER_ROOM = 4
+PEOPLE_PER_ROOM = 5
+SMALLEST_SHARE = 1 / 1500  # of the image's pixels; a smaller visible part of a person is not annotated
+SUPERSAMPLING = 2
+_COUNT_CHANCE = (0.08, 0.22, 0.26, 0.22, 0.14, 0.08)  # of 0, 1, .. 5 people
+
+
+@dataclass(frozen=True)
+class Picture:
+    """image: [H, W, 3] uint8 RGB; masks: [n, H, W] bool, the visible part of every person large enough."""
+
+    image: NDArray[np.uint8]
+    masks: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A room with the people who may appear in it."""
+
+    room: Room
+    people: tuple[bodies.Person, ...]
+    atlas: Atlas
+
+
+def draw_stage(rng: np.random.Generator, detail: int) -> Stage:
+    """A room of its own and five people; detail as in `furnished_room`."""
+    size = (float(rng.uniform(4.5, 7.5)), float(rng.uniform(4.5, 7.0)), float(rng.uniform(2.4, 3.0)))
+    room = furnished_room(rng, size, float(rng.uniform(1.8, size[1] - 1.3)), detail)
+    people = tuple(bodies.draw_person(rng) for _ in range(PEOPLE_PER_ROOM))
+    atlas = Atlas([*room.textures, *(look for person in people for look in person.textures)])
+    return Stage(room, people, atlas)
+
+
+def take_picture(stage: Stage, rng: np.random.Generator, size: tuple[int, int]) -> Picture:
+    """One picture by a hand-held camera somewhere in the room. size: (height, width), px."""
+    camera = Camera.freiburg3(size).resized(SUPERSAMPLING)
+    T_wc = _camera_pose(stage.room, rng)
+    room = stage.room
+    meshes = [room.mesh]
+    for k, place in enumerate(_places(room, rng, T_wc)):
+        person = stage.people[k]
+        body = bodies.person_mesh(person, bodies.draw_pose(rng), place, float(rng.uniform(0, 2 * np.pi)))
+        meshes.append(body.named(k + 1, len(room.textures) + 6 * k))
+    view = render(join(meshes), stage.atlas, _relit(room.lighting, rng), camera, T_wc)
+    return Picture(_developed(view.rgb, rng, size), _visible(view.instance, size))
+
+
+def _camera_pose(room: Room, rng: np.random.Generator) -> NDArray[np.float64]:
+    """T_wc of a camera 0.8-1.8 m high in a free spot, looking mostly into the room."""
+    from scipy.spatial.transform import Rotation
+
+    width, length, _ = room.size
+    for _ in range(50):
+        x, y = rng.uniform(-width / 2 + 0.3, width / 2 - 0.3), rng.uniform(0.3, length - 0.5)
+        if room.is_free(x, y, 0.3):
+            break
+    yaw = np.arctan2(0.0 - x, length * 0.55 - y) + rng.normal(0, 0.5)  # from +y towards +x
+    angles = (yaw, rng.normal(-0.08, 0.12), rng.normal(0, 0.06))
+    level = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pose = np.eye(4)
+    pose[:3, :3] = level @ Rotation.from_euler("YXZ", angles).as_matrix()
+    pose[:3, 3] = (x, y, rng.uniform(0.8, 1.8))
+    return pose
+
+
+def _places(room: Room, rng: np.random.Generator, T_wc: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Free spots in front of the camera for 0-5 people, 0.7-5 m away, the outermost cut by the image's border."""
+    wanted = int(rng.choice(len(_COUNT_CHANCE), p=_COUNT_CHANCE))
+    forward = np.arctan2(T_wc[1, 2], T_wc[0, 2])
+    found: list[tuple[float, float]] = []
+    for _ in range(40 * wanted):
+        if len(found) == wanted:
+            break
+        distance, angle = 0.7 + 4.3 * rng.beta(1.3, 1.6), forward + rng.uniform(-0.6, 0.6)
+        x, y = float(T_wc[0, 3] + distance * np.cos(angle)), float(T_wc[1, 3] + distance * np.sin(angle))
+        apart = all(np.hypot(x - a, y - b) > 0.5 for a, b in found)
+        if apart and room.is_free(x, y, 0.25):
+            found.append((x, y))
+    return found
+
+
+def _relit(lighting: Lighting, rng: np.random.Generator) -> Lighting:
+    """Each lamp turned up or down against the ambient light, all warmer or colder."""
+    gain = np.exp(rng.normal(0, 0.3, (len(lighting.lamps), 1))).astype(np.float32)
+    tint = (1 + rng.normal(0, 0.04, 3)).astype(np.float32)
+    return Lighting(lighting.lamps, lighting.power * gain * tint, lighting.ambient * tint)
+
+
+def _developed(rgb: Floats, rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """The supersampled rendering as a photograph of `size`: exposure, motion blur in a third, optics, noise."""
+    rgb = np.minimum(rgb * np.float32(exposure(rgb, 0.42 * float(np.exp(rng.normal(0, 0.25))))), 1)
+    scale = size[1] / 256
+    if rng.random() < 0.33:
+        rgb = smear(rgb, SUPERSAMPLING * scale * float(rng.uniform(1.5, 6)), float(rng.uniform(0, np.pi)))
+    small = cv2.resize(rgb, (size[1], size[0]), interpolation=cv2.INTER_AREA)
+    return photograph(small, rng, float(rng.uniform(0.5, 3.5)), float(rng.uniform(0, 0.5)))
+
+
+def _visible(instance: NDArray[np.int32], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """[n, H, W] who covers at least half of a pixel, of those with enough pixels; no pixel has two owners."""
+    masks = []
+    free = np.ones(size, dtype=np.bool_)
+    for k in range(1, int(instance.max(initial=0)) + 1):
+        cover = cv2.resize((instance == k).astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_AREA)
+        mask = (cover >= 0.5) & free
+        free &= ~mask
+        if mask.sum() >= SMALLEST_SHARE * mask.size:
+            masks.append(mask)
+    return np.stack(masks) if masks else np.zeros((0, *size), dtype=np.bool_)
+
+
+def coco(out: Path, train: int = 500, val: int = 60, size: tuple[int, int] = (192, 256), seed: int = 0) -> None:
+    """Render a COCO-format folder of people in rooms: images/, instances_train.json, instances_val.json.
+
+    No room, garment or body of one split occurs in the other or in a sequence.
+
+    Args:
+        out: new or empty folder.
+        train: number of training images.
+        val: number of validation images.
+        size: height and width of the images, px; at least 48 each.
+        seed: same seed, same bytes.
+    """
+    _check(train, val, size, seed)
+    with new_folder(out) as draft:
+        (draft / "images").mkdir()
+        counts = {}
+        for split, number in (("train", train), ("val", val)):
+            document = _render_split(draft, split, number, size, seed)
+            (draft / f"instances_{split}.json").write_text(json.dumps(document))
+            counts[split] = len(document["annotations"])
+    print(f"{out}: {train} + {val} images with {counts['train']} + {counts['val']} people")
+
+
+def _check(train: int, val: int, size: tuple[int, int], seed: int) -> None:
+    for name, number in (("train", train), ("val", val)):
+        if number < 1:
+            raise DataError(f"{name}: {number} images; a split has at least 1")
+    if min(size) < 48:
+        raise DataError(f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48")
+    if seed < 0:
+        raise DataError(f"seed: {seed} is negative")
+
+
+def _render_split(folder: Path, split: str, number: int, size: tuple[int, int], seed: int) -> dict[str, Any]:
+    """Write one split's images; returns its COCO document."""
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    detail = 512 if max(size) <= 320 else 1024
+    for first in range(0, number, IMAGES_PER_ROOM):
+        rng = stream(seed, f"coco-{split}", first // IMAGES_PER_ROOM)
+        stage = draw_stage(rng, detail)
+        for image_id in range(first + 1, min(first + IMAGES_PER_ROOM, number) + 1):
+            picture = take_picture(stage, rng, size)
+            name = f"{split}_{image_id:06d}.jpg"
+            _write_jpeg(folder / "images" / name, picture.image)
+            images.append({"id": image_id, "file_name": name, "height": size[0], "width": size[1]})
+            for mask in picture.masks:
+                annotations.append(annotate(mask, image_id, len(annotations) + 1))
+    return {
+        "info": {"description": f"synthetic people in rooms, {split}", "seed": seed},
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": 1, "name": "person", "supercategory": "person"}],
+    }
+
+
+def _write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
+    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]):
+        raise DataError(f"{path}: cannot be written")

@@ -1,0 +1,174 @@
+"""Triangles with normals, texture coordinates and instance numbers, and the few solids rooms and people are made of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """T triangles, nothing shared between them.
+
+    corners, normals: [T, 3, 3] m and unit vectors, one frame; uv: [T, 3, 2] in 0..1, v downwards in the texture;
+    texture: [T] int32 index into a list of textures; instance: [T] int32, 0 = room, 1.. = person.
+    """
+
+    corners: Floats
+    normals: Floats
+    uv: Floats
+    texture: NDArray[np.int32]
+    instance: NDArray[np.int32]
+
+    def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Mesh":
+        """The mesh in another frame: rotation [3, 3], translation [3] m."""
+        turn = np.asarray(rotation, dtype=np.float32).T
+        shift = np.asarray(translation, dtype=np.float32)
+        return replace(self, corners=self.corners @ turn + shift, normals=self.normals @ turn)
+
+    def named(self, instance: int, first_texture: int) -> "Mesh":
+        """The mesh as instance number `instance`, its textures starting at `first_texture` of a longer list."""
+        return replace(
+            self,
+            instance=np.full_like(self.instance, instance),
+            texture=(self.texture + first_texture).astype(np.int32),
+        )
+
+
+def join(meshes: Sequence[Mesh]) -> Mesh:
+    """All triangles of `meshes`, in order; texture and instance numbers stay as they are."""
+    return Mesh(
+        np.concatenate([m.corners for m in meshes]),
+        np.concatenate([m.normals for m in meshes]),
+        np.concatenate([m.uv for m in meshes]),
+        np.concatenate([m.texture for m in meshes]),
+        np.concatenate([m.instance for m in meshes]),
+    )
+
+
+def yaw_rotation(yaw: float) -> Floats:
+    """[3, 3] rotation by `yaw` rad about the vertical axis z."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=np.float32)
+
+
+def grid(points: Floats, texture: int, closed: bool) -> Mesh:
+    """The surface through a grid of points, smooth normals.
+
+    points: [R, S, 3] m. closed: the last column meets the first (a tube); uv then runs once around along u.
+    Normals of a closed surface point away from the line through the rings' centres.
+    """
+    ring = np.concatenate([points, points[:, :1]], axis=1) if closed else points
+    faces, uv = _topology(ring.shape[0], ring.shape[1])
+    along = _differences(ring)
+    if closed:
+        wrapped = np.concatenate([points[:, -1:], points, points[:, :2]], axis=1)
+        around = wrapped[:, 2:] - wrapped[:, :-2]
+    else:
+        around = _differences(ring.transpose(1, 0, 2)).transpose(1, 0, 2)
+    normals = _cross(around, along)
+    normals /= np.maximum(np.sqrt(np.einsum("rsk,rsk->rs", normals, normals))[..., None], 1e-12)
+    if closed:
+        outward = points - points.mean(axis=1, keepdims=True)
+        if np.vdot(normals[:, :-1], outward) < 0:
+            normals = -normals
+    return Mesh(
+        ring.reshape(-1, 3)[faces].astype(np.float32),
+        normals.reshape(-1, 3)[faces].astype(np.float32),
+        uv,
+        np.full(len(faces), texture, dtype=np.int32),
+        np.zeros(len(faces), dtype=np.int32),
+    )
+
+
+@lru_cache(maxsize=32)
+def _topology(rows: int, columns: int) -> tuple[NDArray[np.int64], Floats]:
+    """Faces [T, 3] over a grid of vertices, and their uv [T, 3, 2]."""
+    v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    return faces, np.stack([u, v], -1).reshape(-1, 2)[faces].astype(np.float32)
+
+
+def _unit(vectors: Floats) -> Floats:
+    """[n, 3] scaled to length 1."""
+    return vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
+
+
+def _differences(rows: Floats) -> Floats:
+    """Central differences along the first axis (one-sided at its ends), up to a factor."""
+    padded = np.concatenate([rows[:1], rows, rows[-1:]])
+    return padded[2:] - padded[:-2]
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+
+
+def quad(origin: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, texture: int) -> Mesh:
+    """A parallelogram from `origin` [3] m along `edge_u` (u 0..1) and `edge_v` (v 0..1)."""
+    o, a, b = (np.asarray(p, dtype=np.float32) for p in (origin, edge_u, edge_v))
+    return grid(np.stack([np.stack([o, o + a]), np.stack([o + b, o + a + b])]), texture, closed=False)
+
+
+def box(centre: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> Mesh:
+    """A box turned by `yaw` rad about z; `centre` [3] and `size` [3] m; textures of its sides and of its top."""
+    x, y, z = (float(v) / 2 for v in np.asarray(size, dtype=np.float32))
+    faces = [
+        quad((-x, -y, z), (2 * x, 0, 0), (0, 0, -2 * z), side),
+        quad((x, y, z), (-2 * x, 0, 0), (0, 0, -2 * z), side),
+        quad((-x, y, z), (0, -2 * y, 0), (0, 0, -2 * z), side),
+        quad((x, -y, z), (0, 2 * y, 0), (0, 0, -2 * z), side),
+        quad((-x, y, z), (2 * x, 0, 0), (0, -2 * y, 0), top),
+        quad((-x, -y, -z), (2 * x, 0, 0), (0, 2 * y, 0), top),
+    ]
+    return join(faces).moved(yaw_rotation(yaw), centre)
+
+
+def tube(centres: Floats, radii: Floats, side: ArrayLike, texture: int, segments: int = 12) -> Mesh:
+    """A closed tube of elliptic rings.
+
+    centres: [R, 3] m; radii: [R, 2] m along `side` (made orthogonal to the tube) and across it.
+    u = 0.5 lies on the ring's across axis, side x tangent.
+    """
+    across = np.asarray(side, dtype=np.float32)
+    tangent = _unit(_differences(centres))
+    wide = _unit(across - tangent * (tangent @ across)[:, None])
+    deep = _cross(wide, tangent)
+    angle = 2 * np.pi * np.arange(segments) / segments - np.pi
+    offsets = (
+        np.cos(angle)[None, :, None] * (deep * radii[:, 1:])[:, None]
+        + np.sin(angle)[None, :, None] * (wide * radii[:, :1])[:, None]
+    )
+    return grid((centres[:, None] + offsets).astype(np.float32), texture, closed=True)
+
+
+def capsule(start: ArrayLike, end: ArrayLike, radii: tuple[float, float], side: ArrayLike, texture: int) -> Mesh:
+    """A limb: a tapered tube with round ends from `start` to `end` [3] m, a little fuller in its upper middle."""
+    a, b = np.asarray(start, dtype=np.float32), np.asarray(end, dtype=np.float32)
+    length = max(float(np.linalg.norm(b - a)), 1e-6)
+    axis = (b - a) / length
+    cap = np.radians([88, 60, 30])
+    reach = np.concatenate(
+        [-radii[0] * np.sin(cap), length * np.linspace(0, 1, 5), length + radii[1] * np.sin(cap[::-1])]
+    )
+    t = np.linspace(0, 1, 5)
+    middle = radii[0] + (radii[1] - radii[0]) * t + 0.12 * radii[0] * np.sin(np.pi * t**0.8)
+    r = np.concatenate([radii[0] * np.cos(cap), middle, radii[1] * np.cos(cap[::-1])])
+    centres = (a + reach[:, None] * axis).astype(np.float32)
+    return tube(centres, np.stack([r, r], 1).astype(np.float32), side, texture, segments=10)
+
+
+def ellipsoid(centre: ArrayLike, radii: tuple[float, float, float], texture: int) -> Mesh:
+    """An ellipsoid with its axes along x, y, z; u = 0.5 faces +x, v runs from the top down. radii: m."""
+    polar = np.radians([2, 25, 50, 70, 90, 110, 130, 155, 178])
+    centres = np.zeros((len(polar), 3), dtype=np.float32)
+    centres[:, 2] = radii[2] * np.cos(polar)
+    rings = np.stack([radii[1] * np.sin(polar), radii[0] * np.sin(polar)], 1).astype(np.float32)
+    centres += np.asarray(centre, dtype=np.float32)
+    return tube(centres, rings, (0.0, -1.0, 0.0), texture, segments=14)

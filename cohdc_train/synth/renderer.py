@@ -1,0 +1,195 @@
+"""Ray casting (Embree) of textured triangles: colour, exact depth and instance numbers of every pixel."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.synth.mesh import Floats, Mesh
+from cohdc_train.synth.scene import Lighting
+from cohdc_train.synth.textures import Texture
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; px. Whole numbers are pixel centres, as in TUM's intrinsics."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @classmethod
+    def freiburg3(cls, size: tuple[int, int]) -> "Camera":
+        """TUM's freiburg3 camera (640 x 480) scaled to `size` (height, width)."""
+        sy, sx = size[0] / 480, size[1] / 640
+        return cls(535.4 * sx, 539.2 * sy, (320.1 + 0.5) * sx - 0.5, (247.6 + 0.5) * sy - 0.5, size[1], size[0])
+
+    def resized(self, factor: float) -> "Camera":
+        """The same view with `factor` times as many pixels a side."""
+        return Camera(
+            self.fx * factor,
+            self.fy * factor,
+            (self.cx + 0.5) * factor - 0.5,
+            (self.cy + 0.5) * factor - 0.5,
+            round(self.width * factor),
+            round(self.height * factor),
+        )
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the N rays of a view meet. triangle: [N] int32, -1 = nothing; weights: [N, 2] barycentric; depth: [N] m;
+    directions: [N, 3] world frame."""
+
+    triangle: NDArray[np.int32]
+    weights: Floats
+    depth: Floats
+    directions: Floats
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered frame.
+
+    rgb: [H, W, 3] float32 >= 0, light before exposure; depth: [H, W] m along the optical axis, 0 = nothing;
+    instance: [H, W] int32, 0 = room; facing: [H, W] cosine between the ray and the surface normal.
+    """
+
+    rgb: Floats
+    depth: Floats
+    instance: NDArray[np.int32]
+    facing: Floats
+
+
+class Atlas:
+    """All textures with their reduced copies in one image, so that one remap colours a frame."""
+
+    _WIDTH = 4096
+
+    def __init__(self, textures: Sequence[Texture]) -> None:
+        """textures: [h, w, 3] uint8, sides powers of two of at most 2048."""
+        order = sorted(range(len(textures)), key=lambda k: -textures[k].shape[0])
+        places: dict[int, tuple[int, int]] = {}
+        x = y = shelf = 0
+        for k in order:
+            height, width = textures[k].shape[:2]
+            if x + width * 3 // 2 > self._WIDTH:
+                x, y, shelf = 0, y + shelf, 0
+            places[k] = (x, y)
+            x, shelf = x + width * 3 // 2, max(shelf, height)
+        self.image: Texture = np.zeros((y + shelf, self._WIDTH, 3), dtype=np.uint8)
+        self.levels = np.array([int(np.log2(min(t.shape[:2]))) - 1 for t in textures], dtype=np.int32)
+        self.size = np.array([[t.shape[1], t.shape[0]] for t in textures], dtype=np.float32)
+        self.corner = np.zeros((len(textures), int(self.levels.max()), 2), dtype=np.float32)
+        for k, (left, top) in places.items():
+            self._place(k, textures[k], left, top)
+
+    def _place(self, k: int, image: Texture, left: int, top: int) -> None:
+        x, y = left, top
+        for level in range(int(self.levels[k])):
+            height, width = image.shape[:2]
+            self.image[y : y + height, x : x + width] = image
+            self.corner[k, level] = (x, y)
+            x, y = (left + width, top) if level == 0 else (x, y + height)
+            image = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+
+    def sample(self, texture: NDArray[np.int32], uv: Floats, footprint: Floats, columns: int) -> Floats:
+        """[N, 3] float32 0..1 colours. uv: [N, 2]; footprint: [N] texels of the full texture a pixel covers."""
+        level = np.rint(np.log2(np.maximum(footprint, 1.0))).astype(np.int32)
+        level = np.minimum(level, self.levels[texture] - 1)
+        size = self.size[texture] * np.exp2(-level.astype(np.float32))[:, None]
+        inside = np.minimum(np.maximum(uv * size - 0.5, 0), size - 1)
+        place = (self.corner[texture, level] + inside).reshape(-1, columns, 2)
+        found = cv2.remap(self.image, place, None, cv2.INTER_LINEAR)
+        return found.reshape(-1, 3).astype(np.float32) * np.float32(1 / 255)
+
+
+@lru_cache(maxsize=4)
+def rays(camera: Camera) -> Floats:
+    """[H * W, 3] directions in the camera frame with z = 1, so that a ray's length parameter is the depth."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
+
+
+def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
+    """First hits of all rays of `camera` at `T_wc` [4, 4] (camera to world, m)."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.corners)
+    directions = np.ascontiguousarray(rays(camera) @ T_wc[:3, :3].T.astype(np.float32))
+    origins = np.broadcast_to(T_wc[:3, 3].astype(np.float32), directions.shape).copy()
+    found = scene.run(origins, directions, output=1)
+    weights = np.stack([found["u"], found["v"]], 1)
+    return Hits(found["primID"], weights, found["tfar"], directions)
+
+
+def instances(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> NDArray[np.int32]:
+    """[H, W] instance numbers only, 0 where nothing is met: a quick look without colours."""
+    triangle = cast(mesh, camera, T_wc).triangle
+    found = np.where(triangle >= 0, mesh.instance[np.maximum(triangle, 0)], 0)
+    return found.reshape(camera.height, camera.width).astype(np.int32)
+
+
+def render(mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: NDArray[np.float64]) -> View:
+    """Colour, depth and instances of `mesh` seen by `camera` at `T_wc` [4, 4] (camera to world, m)."""
+    hits = cast(mesh, camera, T_wc)
+    triangle = np.maximum(hits.triangle, 0)
+    met = hits.triangle >= 0
+    depth = np.where(met, hits.depth, 0).astype(np.float32)
+    normal = _interpolated(mesh.normals, triangle, hits.weights)
+    slant = _dot(normal, hits.directions) / np.maximum(np.sqrt(_dot(normal, normal)), 1e-9)
+    normal /= np.copysign(np.maximum(np.sqrt(_dot(normal, normal)), 1e-9), -slant)[:, None]
+    facing = np.abs(slant) / np.sqrt(_dot(hits.directions, hits.directions))
+    uv = _interpolated(mesh.uv, triangle, hits.weights)
+    footprint = depth / np.float32(camera.fx) * _density(mesh, atlas)[triangle] / np.sqrt(np.maximum(facing, 0.1))
+    albedo = atlas.sample(mesh.texture[triangle], uv, footprint, camera.width)
+    position = hits.directions * depth[:, None] + T_wc[:3, 3].astype(np.float32)
+    rgb = albedo * _light(position, normal, lighting) * met[:, None]
+    shape = (camera.height, camera.width)
+    instance = np.where(met, mesh.instance[triangle], 0).astype(np.int32)
+    return View(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape), facing.reshape(shape))
+
+
+def _interpolated(corners: Floats, triangle: NDArray[np.int32], weights: Floats) -> Floats:
+    """[N, C] a value given at the corners [T, 3, C], at barycentric weights of the second and third corner."""
+    first = corners[:, 0]
+    second, third = corners[:, 1] - first, corners[:, 2] - first
+    value: Floats = np.take(first, triangle, axis=0)
+    value += np.take(second, triangle, axis=0) * weights[:, :1]
+    value += np.take(third, triangle, axis=0) * weights[:, 1:]
+    return value
+
+
+def _density(mesh: Mesh, atlas: Atlas) -> Floats:
+    """[T] texels per metre of every triangle."""
+    edges = mesh.corners[:, 1:] - mesh.corners[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    spans = (mesh.uv[:, 1:] - mesh.uv[:, :1]) * atlas.size[mesh.texture][:, None]
+    texels = np.abs(spans[:, 0, 0] * spans[:, 1, 1] - spans[:, 0, 1] * spans[:, 1, 0])
+    return np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
+
+
+def _light(position: Floats, normal: Floats, lighting: Lighting) -> Floats:
+    """[N, 3] light that falls on every point: ambient, stronger from above, and lamps with a falloff."""
+    total: Floats = lighting.ambient * (0.82 + 0.18 * normal[:, 2:])
+    for lamp, power in zip(lighting.lamps, lighting.power, strict=True):
+        ray = lamp - position
+        square = np.maximum(_dot(ray, ray), np.float32(1e-6))
+        cosine = np.maximum(_dot(ray, normal), 0)
+        total += power * (cosine / (np.sqrt(square) * (1 + np.float32(0.12) * square)))[:, None]
+    return total
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    """[N] row by row."""
+    product: Floats = np.einsum("ij,ij->i", a, b)
+    return product
