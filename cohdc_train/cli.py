@@ -29,16 +29,18 @@ VERBS = {
     "env": Verb("env", "env", "versions of everything that matters, and what is wrong with them"),
 }
 
-_TRAIN_PACKAGES = frozenset(
-    ["torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "kornia", "rich"]
-    + ["tensorboard", "embreex"]
-)
+# fmt: off
+_TRAIN_PACKAGES = frozenset({
+    "torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "kornia", "rich",
+    "tensorboard", "embreex",
+})
+# fmt: on
 
 
 def help_text() -> str:
     """What `cohdc --help` prints."""
     rows = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
-    return f"usage: cohdc VERB [options]\n\n{rows}\n\ncohdc VERB --help tells a verb's options; cohdc --version the version."
+    return f"usage: cohdc VERB [options]\n\n{rows}\n\ncohdc VERB --help tells a verb's options."
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""RoI masks -> masks of the whole image: the one paste that training's scores, `predict` and SLAM share (numpy, OpenCV)."""
+"""RoI masks -> masks of the whole image: the one paste that training's scores, `predict` and SLAM share."""
 
 import cv2
 import numpy as np

@@ -8,7 +8,7 @@ fixed in the file. Rows at or after `count` are padding and hold zeros.
 | images | uint8 [B, H, W, 3] | RGB |
 | boxes | float32 [B, N, 4] | xyxy, px of the input image, origin at the corner of its first pixel |
 | labels | int64 [B, N] | index into the class names |
-| scores | float32 [B, N] | class score, falling; times quality where the file says `rescored` |
+| scores | float32 [B, N] | class score, falling |
 | quality | float32 [B, N] | CQE's estimate of the mask's IoU with the object, 0..1 |
 | masks | float32 [B, N, M, M] | probability inside the box; cell (i, j) is centred (i + .5) / M of its side |
 | count | int64 [B] | how many leading rows are detections |
@@ -24,5 +24,5 @@ KEY_CONTRACT = "cohdc.contract"  # CONTRACT_VERSION
 KEY_VERSION = "cohdc.version"  # version of the package that wrote the file
 KEY_CLASSES = "cohdc.classes"  # JSON: [name, ...] in label order
 KEY_INPUT = "cohdc.input"  # JSON: {"color", "layout", "dtype", "canvas": [height, width], "resize"}
-KEY_THRESHOLDS = "cohdc.thresholds"  # JSON: {"score", "nms_iou", "mask", "rescored"}
+KEY_THRESHOLDS = "cohdc.thresholds"  # JSON: {"score", "nms_iou", "mask"}
 METADATA_KEYS = (KEY_CONTRACT, KEY_VERSION, KEY_CLASSES, KEY_INPUT, KEY_THRESHOLDS)

@@ -36,7 +36,7 @@ class CQEHead(nn.Module):
         )
         self.quality = nn.Linear(fc, num_classes)
         for module in self.modules():
-            if isinstance(module, nn.Conv2d):
+            if isinstance(module, nn.Conv2d) and module.bias is not None:
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
                 nn.init.zeros_(module.bias)
 
@@ -58,13 +58,15 @@ def cqe_targets(masks: Tensor, boxes: Tensor, gt_masks: Tensor, matched: Tensor)
     side = masks.shape[-1]
     truth = gt_masks.to(boxes.dtype)
     rois = torch.cat([matched[:, None].to(boxes.dtype), boxes], dim=1)
-    inside = roi_align(truth[:, None], rois, (side, side), sampling_ratio=2, aligned=True)[:, 0]
+    covered = roi_align(truth[:, None], rois, (side, side), sampling_ratio=2, aligned=True)[:, 0]
+    inside = (covered >= 0.5).to(boxes.dtype)
     predicted = (masks > 0.5).to(boxes.dtype)
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     whole = truth.sum(dim=(1, 2))[matched] * side**2 / area.clamp(min=1.0)
     intersection = (predicted * inside).sum(dim=(1, 2))
     union = predicted.sum(dim=(1, 2)) + whole - intersection
-    return (intersection / union.clamp(min=1e-6)).clamp(0.0, 1.0)
+    iou: Tensor = intersection / union.clamp(min=1e-6)
+    return iou.clamp(0.0, 1.0)
 
 
 def cqe_loss(quality: Tensor, labels: Tensor, targets: Tensor) -> Tensor:

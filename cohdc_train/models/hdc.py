@@ -48,7 +48,7 @@ def cycle(pattern: Sequence[int], layers: int) -> tuple[int, ...]:
     if missing:
         named = ", ".join(str(offset) for offset in missing if offset > 0)
         raise ValueError(
-            f"HDC rates {rates} leave holes: offsets +-({named}) px of a receptive field of {receptive_field(rates)} px "
-            f"are never seen (eq. 1: M_2 = {max_distance(rates)}, K = 3)"
+            f"HDC rates {rates} leave holes: offsets +-({named}) px of a field of {receptive_field(rates)} px are "
+            f"never seen (eq. 1: M_2 = {max_distance(rates)}, K = 3)"
         )
     return rates

@@ -3,7 +3,7 @@
 No shape depends on what is in the image; rows that hold no detection are zeros behind `count`.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,8 +16,9 @@ _CANDIDATES = 1000  # best (proposal, class) pairs that enter the last suppressi
 _MIN_SIDE = 1e-2  # px on the canvas; smaller boxes hold nothing
 
 
-class PaddedDetections(NamedTuple):
-    """The output tensors in the order of `cohdc_train.signature.OUTPUTS`; boxes in px of the input image."""
+@dataclass(frozen=True)
+class PaddedDetections:
+    """The output tensors in the order of `cohdc_train.signature.OUTPUTS`, of which they are."""
 
     boxes: Tensor
     labels: Tensor
@@ -28,18 +29,21 @@ class PaddedDetections(NamedTuple):
 
 
 class Detector(torch.nn.Module):
-    """A MaskRCNN as the function that is exported: uint8 images [B, H, W, 3] RGB -> PaddedDetections."""
+    """A MaskRCNN as the function that is exported: uint8 images [B, H, W, 3] RGB -> the outputs of
+    `cohdc_train.signature`, in its order.
+    """
 
     def __init__(self, network: MaskRCNN) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, images: Tensor) -> PaddedDetections:
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         """images: uint8 [B, H, W, 3] RGB, any H and W. Rows of the result fall by score."""
         rows, columns = self.network.config.canvas
         canvas, geometry = letterbox(images, rows, columns)
         found = detect_on_canvas(self.network, canvas, geometry[None, :2].expand(images.shape[0], 2))
-        return found._replace(boxes=found.boxes * geometry[[3, 2, 3, 2]])
+        boxes = found.boxes * torch.stack([geometry[3], geometry[2], geometry[3], geometry[2]])
+        return boxes, found.labels, found.scores, found.quality, found.masks, found.count
 
 
 @torch.no_grad()
@@ -57,9 +61,8 @@ def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
     results = []
     for i in range(len(images)):
         n = int(found.count[i])
-        fields: dict[str, Any] = {"boxes": boxes[i, :n]}
-        fields |= {name: getattr(found, name)[i, :n] for name in ("labels", "scores", "quality", "masks")}
-        results.append(fields)
+        rest = {name: getattr(found, name)[i, :n] for name in ("labels", "scores", "quality", "masks")}
+        results.append({"boxes": boxes[i, :n], **rest})
     return results
 
 

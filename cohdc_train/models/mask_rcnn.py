@@ -102,7 +102,7 @@ class Backbone(nn.Module):
         self.fpn = FeaturePyramidNetwork(self.body.out_channels, config.fpn_channels, pool)
 
     def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
-        """x: [B, 3, H, W] normalised. Returns the pyramid, "0" at stride 4 to "3" at stride 32, perhaps "pool" at 64."""
+        """x: [B, 3, H, W] normalised. Returns the pyramid, "0" at stride 4 to "3" at 32, perhaps "pool" at 64."""
         features: OrderedDict[str, Tensor] = self.fpn(self.body(x))
         return features
 

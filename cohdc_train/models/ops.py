@@ -13,7 +13,7 @@ CANONICAL_SIDE, CANONICAL_LEVEL = 224, 4  # FPN's rule: a 224 px box is pooled f
 
 
 def fitted_size(height: int, width: int, canvas: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) in px of an image resized into the canvas, its aspect kept to the nearest pixel; integers only."""
+    """(height, width) in px of an image fitted into the canvas, its aspect kept to the nearest pixel; integers only."""
     rows, columns = canvas
     if rows * width <= columns * height:
         return rows, max(1, (2 * width * rows + height) // (2 * height))

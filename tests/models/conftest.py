@@ -1,0 +1,38 @@
+"""A network small enough for a test, with weights that give it opinions."""
+
+import pytest
+import torch
+
+from cohdc_train.models import MaskRCNN, NetworkConfig
+
+SMALL = NetworkConfig(
+    depth=18,
+    width=0.25,
+    canvas=(96, 128),
+    fpn_channels=16,
+    fc=32,
+    proposals=(100, 50),
+    rois=32,
+    detections=10,
+    anchor_scales=(16, 32, 64, 128),
+    score_threshold=0.45,
+)
+
+
+@pytest.fixture(scope="session")
+def opinionated():
+    """Random weights, scaled until scores, boxes and masks differ from place to place."""
+    torch.manual_seed(0)
+    network = MaskRCNN(2, SMALL).eval()
+    with torch.no_grad():
+        network.roi_heads.box_predictor.cls_score.weight.mul_(12)
+        network.rpn.head.cls_logits.weight.mul_(8)
+        network.rpn.head.bbox_pred.weight.mul_(10)
+        network.roi_heads.mask_predictor.mask_fcn_logits.weight.mul_(5)
+    return network
+
+
+@pytest.fixture
+def small_config():
+    """The shape of the small network."""
+    return SMALL

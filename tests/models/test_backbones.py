@@ -1,0 +1,72 @@
+"""The HDC ResNet is torchvision's ResNet with other dilations: same tensors, same strides, whole coverage."""
+
+import pytest
+import torch
+from torchvision.models import resnet18, resnet50
+from torchvision.models.feature_extraction import create_feature_extractor
+
+from cohdc_train.models.backbones import HDCResNet, load_backbone_weights
+
+PLAIN = ((1,),) * 4
+
+
+@pytest.mark.parametrize(("depth", "build"), [(18, resnet18), (50, resnet50)])
+def test_undilated_it_computes_what_torchvisions_resnet_computes(tmp_path, depth, build):
+    torch.manual_seed(0)
+    reference = build(weights=None).eval()
+    torch.save(reference.state_dict(), tmp_path / "weights.pth")
+    backbone = HDCResNet(depth, rates=PLAIN).eval()
+    load_backbone_weights(backbone, depth, str(tmp_path / "weights.pth"))
+    image = torch.rand(1, 3, 64, 96)
+    stages = create_feature_extractor(reference, {f"layer{i + 1}": str(i) for i in range(4)})(image)
+    features = backbone(image)
+    for name in "0123":
+        torch.testing.assert_close(features[name], stages[name])
+
+
+@pytest.mark.parametrize("depth", [18, 34, 50])
+def test_dilation_keeps_strides_and_channels(depth):
+    backbone = HDCResNet(depth, width=0.25).eval()
+    features = backbone(torch.zeros(1, 3, 64, 128))
+    sides = [tuple(f.shape[1:]) for f in features.values()]
+    assert sides == [(c, 64 // s, 128 // s) for c, s in zip(backbone.out_channels, (4, 8, 16, 32), strict=True)]
+
+
+def test_the_strided_convolution_keeps_rate_one_and_the_pattern_follows():
+    backbone = HDCResNet(50)
+    rates = [block.conv2.dilation[0] for block in backbone.layer3]
+    assert rates == [1, 1, 2, 3, 1, 2]
+    assert [block.conv2.dilation[0] for block in backbone.layer1] == [1, 2, 3]
+
+
+def test_a_pattern_with_holes_is_refused_by_the_backbone():
+    with pytest.raises(ValueError, match="leave holes"):
+        HDCResNet(18, rates=((2,), (1,), (1,), (1,)))
+
+
+def test_three_patterns_are_refused():
+    with pytest.raises(ValueError, match="3 patterns for 4 stages"):
+        HDCResNet(18, rates=((1,),) * 3)
+
+
+def test_frozen_stages_learn_nothing_and_keep_their_statistics():
+    backbone = HDCResNet(18, width=0.25, frozen_stages=2).train()
+    before = {name: value.clone() for name, value in backbone.state_dict().items()}
+    optimizer = torch.optim.SGD([p for p in backbone.parameters() if p.requires_grad], lr=1.0)
+    backbone(torch.rand(2, 3, 64, 64))["3"].sum().backward()
+    optimizer.step()
+    changed = {
+        name.split(".")[0] for name, value in backbone.state_dict().items() if not torch.equal(value, before[name])
+    }
+    assert changed == {"layer2", "layer3", "layer4"}
+
+
+def test_weights_of_another_depth_are_refused_by_name(tmp_path):
+    torch.save(resnet50(weights=None).state_dict(), tmp_path / "r50.pth")
+    with pytest.raises(ValueError, match=r"r50\.pth: layer1\.0\.conv1\.weight is \[64, 64, 1, 1\]"):
+        load_backbone_weights(HDCResNet(18), 18, str(tmp_path / "r50.pth"))
+
+
+def test_a_missing_file_lists_the_published_names(tmp_path):
+    with pytest.raises(FileNotFoundError, match="IMAGENET1K_V1"):
+        load_backbone_weights(HDCResNet(18), 18, str(tmp_path / "nothing.pth"))

@@ -1,0 +1,68 @@
+"""CQE targets and loss: known answers."""
+
+import pytest
+import torch
+
+from cohdc_train.models.cqe import CQEHead, cqe_loss, cqe_targets
+
+
+def _scene(rows=slice(20, 60), columns=slice(10, 50)):
+    truth = torch.zeros(1, 100, 100, dtype=torch.uint8)
+    truth[0, rows, columns] = 1
+    return truth
+
+
+def test_a_perfect_mask_in_a_tight_box_has_quality_one():
+    box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
+    target = cqe_targets(torch.ones(1, 28, 28), box, _scene(), torch.tensor([0]))
+    assert target.item() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_truth_outside_the_box_counts():
+    """The box holds half of the object and the mask fills it: IoU 1/2 with the whole, though 1 inside the box."""
+    box = torch.tensor([[10.0, 20.0, 30.0, 60.0]])
+    target = cqe_targets(torch.ones(1, 28, 28), box, _scene(), torch.tensor([0]))
+    assert target.item() == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_mask_larger_than_the_object_is_punished():
+    box = torch.tensor([[10.0, 20.0, 90.0, 60.0]])
+    target = cqe_targets(torch.ones(1, 28, 28), box, _scene(), torch.tensor([0]))
+    assert target.item() == pytest.approx(0.5, abs=0.02)
+
+
+def test_an_empty_mask_has_quality_zero():
+    box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
+    assert cqe_targets(torch.zeros(1, 28, 28), box, _scene(), torch.tensor([0])).item() == 0.0
+
+
+def test_each_box_is_held_against_its_own_object():
+    truth = torch.cat([_scene(), _scene(slice(60, 100), slice(60, 100))])
+    boxes = torch.tensor([[60.0, 60.0, 100.0, 100.0], [10.0, 20.0, 50.0, 60.0]])
+    target = cqe_targets(torch.ones(2, 28, 28), boxes, truth, torch.tensor([1, 0]))
+    torch.testing.assert_close(target, torch.ones(2), atol=1e-5, rtol=0)
+
+
+def test_loss_is_half_the_squared_error_over_positive_targets():
+    quality = torch.tensor([[0.2, 0.9], [0.5, 0.4], [0.0, 0.0]])
+    loss = cqe_loss(quality, torch.tensor([1, 0, 0]), torch.tensor([0.7, 0.9, 0.0]))
+    assert loss.item() == pytest.approx(0.5 * (0.2**2 + 0.4**2) / 2)
+
+
+def test_without_a_positive_the_loss_is_zero_and_reaches_every_parameter():
+    head = CQEHead(8, 2, channels=8, fc=16)
+    loss = cqe_loss(
+        head(torch.rand(0, 8, 14, 14), torch.rand(0, 28, 28)), torch.zeros(0, dtype=torch.long), torch.zeros(0)
+    )
+    loss.backward()
+    assert loss.item() == 0.0
+    assert all(p.grad is not None for p in head.parameters())
+
+
+def test_the_head_learns_from_the_mask_it_is_shown():
+    torch.manual_seed(0)
+    head = CQEHead(4, 1, channels=8, fc=16)
+    features, masks = torch.rand(2, 4, 14, 14), torch.rand(2, 28, 28, requires_grad=True)
+    head(features, masks).sum().backward()
+    assert masks.grad is not None
+    assert masks.grad.abs().sum() > 0

@@ -1,0 +1,159 @@
+"""The network against torchvision's own Mask R-CNN, its losses at the edges, and that it can learn two pictures."""
+
+import dataclasses
+
+import pytest
+import torch
+from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
+from torchvision.ops import box_iou
+
+from cohdc_train.models import Detector, MaskRCNN, NetworkConfig, detect
+from cohdc_train.models.inference import _anchors
+
+
+def _target(boxes, size=(96, 128), ignore=()):
+    masks = torch.zeros(len(boxes), *size, dtype=torch.uint8)
+    for mask, (x0, y0, x1, y1) in zip(masks, boxes, strict=True):
+        mask[y0:y1, x0:x1] = 1
+    return {
+        "boxes": torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4),
+        "labels": torch.ones(len(boxes), dtype=torch.int64),
+        "masks": masks,
+        "ignore": torch.tensor(ignore, dtype=torch.float32).reshape(-1, 4),
+    }
+
+
+def _torchvisions(network):
+    """Torchvision's detector around the very same modules."""
+    config, backbone = network.config, network.backbone
+    backbone.out_channels = config.fpn_channels
+    heads = network.roi_heads
+    return TorchvisionMaskRCNN(
+        backbone,
+        min_size=config.canvas[0],
+        max_size=config.canvas[1],
+        rpn_anchor_generator=network.rpn.anchor_generator,
+        rpn_head=network.rpn.head,
+        rpn_pre_nms_top_n_test=2 * config.proposals[1],
+        rpn_post_nms_top_n_test=config.proposals[1],
+        box_head=heads.box_head,
+        box_predictor=heads.box_predictor,
+        box_score_thresh=config.score_threshold,
+        box_nms_thresh=config.nms_iou,
+        box_detections_per_img=config.detections,
+        mask_head=heads.mask_head,
+        mask_predictor=heads.mask_predictor,
+    ).eval()
+
+
+def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
+    torch.manual_seed(1)
+    image = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0]
+    image = (image * 255).to(torch.uint8)
+    with torch.inference_mode():
+        expected = _torchvisions(opinionated)([image / 255])[0]
+        found = detect(opinionated, [image])[0]
+    assert len(found["scores"]) >= 3
+    torch.testing.assert_close(found["boxes"], expected["boxes"], atol=1e-3, rtol=0)
+    torch.testing.assert_close(found["scores"], expected["scores"], atol=1e-5, rtol=0)
+    assert torch.equal(found["labels"] + 1, expected["labels"])
+
+
+def test_anchors_equal_torchvisions(opinionated):
+    generator = opinionated.rpn.anchor_generator
+    grids = [(24, 32), (12, 16), (6, 8), (3, 4)]
+    strides = [[torch.tensor(s), torch.tensor(s)] for s in (4, 8, 16, 32)]
+    expected = generator.grid_anchors(grids, strides)
+    for level, (height, width) in enumerate(grids):
+        index = torch.arange(height * width * 3)[None]
+        anchors = _anchors(generator.cell_anchors[level], index, width, 4 * 2**level)[0]
+        torch.testing.assert_close(anchors, expected[level])
+
+
+def test_padding_is_zero_and_scores_fall(opinionated):
+    images = torch.zeros(2, 80, 60, 3, dtype=torch.uint8)
+    images[1] = torch.randint(0, 255, (80, 60, 3))
+    with torch.inference_mode():
+        boxes, labels, scores, quality, masks, count = Detector(opinionated)(images)
+    assert boxes.shape == (2, 10, 4)
+    assert masks.shape == (2, 10, 28, 28)
+    for i in range(2):
+        n = int(count[i])
+        assert torch.all(scores[i, :n] > opinionated.config.score_threshold)
+        assert torch.all(scores[i].diff() <= 0)
+        assert all(not tensor[i, n:].any() for tensor in (boxes, labels, scores, quality, masks))
+
+
+def test_boxes_stay_inside_an_image_of_any_shape(opinionated):
+    with torch.inference_mode():
+        for height, width in ((31, 200), (200, 31), (96, 128)):
+            found = detect(opinionated, [torch.randint(0, 255, (3, height, width), dtype=torch.uint8)])[0]
+            limit = torch.tensor([width, height, width, height]) + 1e-3
+            assert torch.all(found["boxes"] >= 0)
+            assert torch.all(found["boxes"] <= limit)
+
+
+def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter(small_config):
+    network = MaskRCNN(1, small_config)
+    losses = network.losses(torch.rand(2, 3, 96, 128), [_target([]), _target([])])
+    sum(losses.values()).backward()
+    assert all(torch.isfinite(loss) for loss in losses.values())
+    assert losses["cqe"].item() == losses["mask"].item() == losses["box"].item() == 0.0
+    assert all(p.grad is not None for name, p in network.cqe.named_parameters())
+
+
+def test_a_canvas_that_is_no_multiple_of_32_is_padded(small_config):
+    network = MaskRCNN(1, dataclasses.replace(small_config, canvas=(90, 100)))
+    losses = network.losses(torch.rand(1, 3, 90, 100), [_target([[10, 10, 60, 70]], (90, 100))])
+    assert all(torch.isfinite(loss) for loss in losses.values())
+    assert len(detect(network.eval(), [torch.zeros(3, 50, 60, dtype=torch.uint8)])) == 1
+
+
+def test_background_inside_a_crowd_is_no_negative(small_config):
+    network = MaskRCNN(1, small_config)
+    anchors = [torch.tensor([[0.0, 0, 20, 20], [64.0, 64, 96, 96], [10.0, 10, 40, 40]])]
+    plain, crowded = _target([[10, 10, 40, 40]]), _target([[10, 10, 40, 40]], ignore=[[60, 60, 100, 96]])
+    labels = [network.rpn.assign_targets_to_anchors(anchors, [t])[0][0].tolist() for t in (plain, crowded)]
+    assert labels[0] == [0.0, 0.0, 1.0]
+    assert labels[1] == [0.0, -1.0, 1.0]
+
+
+def test_cqe_can_be_left_out(small_config):
+    network = MaskRCNN(1, dataclasses.replace(small_config, cqe="off"))
+    assert "cqe" not in network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])])
+    found = detect(network.eval(), [torch.randint(0, 255, (3, 96, 128), dtype=torch.uint8)])[0]
+    assert torch.all(found["quality"] == 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"anchor_scales": (8, 16, 32)}, "3 scales for 4 or 5 levels"),
+        ({"frozen_stages": 6}, "frozen_stages 6"),
+        ({"weights": "IMAGENET1K_V1", "width": 0.5}, "full width"),
+    ],
+)
+def test_a_config_that_cannot_be_built_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        NetworkConfig(**change)
+
+
+def test_it_learns_two_pictures_and_its_quality_tells_the_truth(small_config):
+    """Overfit: after a few hundred steps both boxes are found, masks fit, and CQE's estimate is near the true IoU."""
+    torch.manual_seed(0)
+    network = MaskRCNN(1, dataclasses.replace(small_config, width=0.5, fpn_channels=32, fc=64, score_threshold=0.3))
+    pictures = torch.full((2, 3, 96, 128), 0.3)
+    corners = [[20, 16, 60, 80], [70, 30, 116, 70]]
+    for picture, (x0, y0, x1, y1) in zip(pictures, corners, strict=True):
+        picture[:, y0:y1, x0:x1] = torch.tensor([0.9, 0.2, 0.1])[:, None, None]
+    targets = [_target([corner]) for corner in corners]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
+    for _ in range(80):
+        optimizer.zero_grad()
+        sum(network.losses(pictures, targets).values()).backward()
+        optimizer.step()
+    found = detect(network.eval(), list((pictures * 255).to(torch.uint8)))
+    for result, target in zip(found, targets, strict=True):
+        assert box_iou(result["boxes"][:1], target["boxes"]).item() > 0.8
+        assert (result["masks"][0] > 0.5).float().mean() > 0.9
+        assert result["quality"][0] > 0.6
