@@ -25,7 +25,7 @@ class Augmentation:
     Attributes:
         flip: probability of a horizontal flip.
         scale_jitter: smallest and largest scale, relative to the one at which the image just fits into the canvas.
-        photometric: vary brightness, contrast, saturation, colour temperature, noise and blur on the device.
+        photometric: vary brightness, contrast, colour temperature, noise and blur on the device.
     """
 
     flip: float = 0.5
@@ -115,10 +115,10 @@ def mask_boxes(masks: Tensor) -> Tensor:
 def photometric_augmentation() -> AugmentationSequential:
     """Colour, noise and blur for float images [B, 3, H, W] in 0..1, drawn per image.
 
-    Hue varies by the colour temperature of the light: a rotation of hue costs five times as much as all the rest.
+    Colour varies by the temperature of the light: hue and saturation, through HSV, cost five times as much as the rest.
     """
     return AugmentationSequential(
-        ColorJiggle(brightness=(0.6, 1.4), contrast=(0.7, 1.3), saturation=(0.7, 1.3), hue=0.0, p=0.8),
+        ColorJiggle(brightness=(0.6, 1.4), contrast=(0.7, 1.3), p=0.8),
         RandomPlanckianJitter(p=0.3),
         RandomGaussianNoise(std=0.02, p=0.2),
         RandomGaussianBlur((3, 3), (0.3, 1.0), p=0.1),

@@ -1,0 +1,174 @@
+"""`cohdc fit` (Lightning's command line) and `cohdc validate`."""
+
+import json
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import auto_cli
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+
+from cohdc_train.data.datamodule import CocoDataModule
+from cohdc_train.errors import CohdcError
+from cohdc_train.presets import config_path
+from cohdc_train.train.module import MaskRCNNModule
+
+_BEST = "val/segm_AP"
+# Lightning's advice that does not apply: how many workers to use is the user's choice, and says so in the help.
+_ADVICE = (".*does not have many workers.*", ".*is smaller than the logging interval.*", ".*Checkpoint directory.*")
+
+
+def fit(args: list[str]) -> Trainer:
+    """Train: `cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR]`; writes below `--out`:
+
+    `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved), `logs/version_N/` (CSV, TensorBoard).
+    Raises CohdcError in one line for whatever the user can mend; a wrong key ends the program with code 2.
+    """
+    with _told_in_one_line():
+        command = FitCommand(
+            MaskRCNNModule,
+            CocoDataModule,
+            args=_resolve_configs(args),
+            run=False,
+            seed_everything_default=0,
+            save_config_callback=_SaveConfig,
+            save_config_kwargs={"overwrite": True, "save_to_log_dir": False},
+            trainer_defaults={"max_epochs": 12, "gradient_clip_val": 5.0, "log_every_n_steps": 10},
+            parser_kwargs={"prog": "cohdc fit", "description": "Train an HDC Mask R-CNN with CQE on COCO-format data."},
+        )
+        command.run()
+    return command.trainer
+
+
+def validate(args: list[str]) -> None:
+    """Score a checkpoint: the arguments of `score`."""
+    with _told_in_one_line():
+        auto_cli(score, args=args, prog="cohdc validate", as_positional=True)
+
+
+def score(
+    checkpoint: Path,
+    root: Path,
+    out: Path | None = None,
+    rescore: bool | None = None,
+    batch_size: int = 2,
+    workers: int = 1,
+    precision: str = "32-true",
+) -> dict[str, float]:
+    """Print a checkpoint's scores on the validation split of a COCO-format folder.
+
+    Args:
+        checkpoint: best.ckpt or last.ckpt of a training.
+        root: the COCO-format folder; its other classes are left out.
+        out: JSON file for the scores.
+        rescore: rank masks by score * quality; the training's choice when not given.
+        batch_size: images per batch.
+        workers: processes that read images.
+        precision: Lightning's precision, such as bf16-mixed.
+    """
+    module = MaskRCNNModule.load(checkpoint)
+    module.rescore = module.rescore if rescore is None else rescore
+    data = CocoDataModule(root, module.class_names, module.network_config.canvas, batch_size, workers)
+    if data.class_names != module.class_names:
+        raise CohdcError(f"{root}: class order {data.class_names} is not the checkpoint's {module.class_names}")
+    trainer = Trainer(logger=False, enable_checkpointing=False, precision=precision, enable_model_summary=False)  # type: ignore[arg-type]
+    (scores,) = trainer.validate(module, datamodule=data, verbose=False)
+    results = {name.removeprefix("val/"): value for name, value in scores.items()}
+    for name, value in results.items():
+        print(f"{name:<14}{value:.4f}")
+    if out is not None:
+        _write_json(out, results)
+    return results
+
+
+class FitCommand(LightningCLI):
+    """Lightning's command line with this project's defaults; `run` trains."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """`--out`, `--ckpt_path`, the checkpoints, and what the network takes over from the data."""
+        parser.add_argument("--out", type=Path, default=Path("runs/fit"), help="folder for everything that is written")
+        parser.add_argument("--ckpt_path", type=Path | None, default=None, help="checkpoint of a training to resume")
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults(
+            {
+                "checkpoint.monitor": _BEST,
+                "checkpoint.mode": "max",
+                "checkpoint.filename": "best",
+                "checkpoint.save_last": True,
+                "checkpoint.enable_version_counter": False,
+            }
+        )
+        parser.link_arguments("out", "checkpoint.dirpath")
+        parser.link_arguments("out", "trainer.default_root_dir")
+        parser.link_arguments("data.canvas", "model.network.canvas")
+        parser.link_arguments("data.class_names", "model.class_names", apply_on="instantiate")
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """The trainer with CSV and TensorBoard logs below `--out` and a rich progress bar, unless told otherwise."""
+        config = self.config["trainer"]
+        if config["logger"] in (None, True):
+            root = Path(self.config["out"])
+            csv = CSVLogger(root, name="logs")
+            kwargs["logger"] = [csv, TensorBoardLogger(root, name="logs", version=csv.version)]
+        if config["enable_progress_bar"] is not False:
+            given = self.config_init["trainer"]["callbacks"] or []
+            kwargs["callbacks"] = [RichProgressBar(leave=True), *(given if isinstance(given, list) else [given])]
+        return super().instantiate_trainer(**kwargs)
+
+    def run(self) -> None:
+        """Train, from the beginning or from `--ckpt_path`."""
+        checkpoint: Path | None = self.config["ckpt_path"]
+        if checkpoint is not None and not checkpoint.is_file():
+            raise CohdcError(f"{checkpoint}: no such file")
+        self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=checkpoint)
+
+
+class _SaveConfig(SaveConfigCallback):
+    """Keeps the resolved configuration beside the checkpoints instead of in a logger's folder."""
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        root = Path(trainer.default_root_dir)
+        root.mkdir(parents=True, exist_ok=True)
+        self.parser.save(self.config, root / "config.yaml", skip_none=False, overwrite=True, multifile=False)
+
+
+def _resolve_configs(args: list[str]) -> list[str]:
+    """Arguments with the files behind `--config` looked up among the shipped ones."""
+    resolved: list[str] = []
+    for arg in args:
+        name, separator, value = arg.partition("=")
+        if resolved and resolved[-1] in ("--config", "-c"):
+            arg = str(config_path(arg))
+        elif name == "--config" and separator:
+            arg = f"{name}={config_path(value)}"
+        resolved.append(arg)
+    return resolved
+
+
+@contextmanager
+def _told_in_one_line() -> Iterator[None]:
+    """Turn what a user can cause (bad values, files, a reader's error in a worker process) into a CohdcError."""
+    with warnings.catch_warnings():
+        for message in _ADVICE:
+            warnings.filterwarnings("ignore", message)
+        try:
+            yield
+        except CohdcError as error:
+            lines = str(error).strip().splitlines()
+            raise CohdcError(lines[-1].partition("Error: ")[2] if len(lines) > 1 else str(error)) from error
+        except (MisconfigurationException, FileNotFoundError) as error:
+            raise CohdcError(" ".join(str(error).split())) from error
+
+
+def _write_json(path: Path, content: dict[str, float]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(path.suffix + ".part")
+    temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, path)

@@ -1,0 +1,177 @@
+"""Lightning around the network: losses, optimizer and schedule, validation scores, checkpoints."""
+
+import dataclasses
+import math
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
+
+from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
+from cohdc_train.errors import CohdcError
+from cohdc_train.models import MaskRCNN, NetworkConfig, detect
+from cohdc_train.train.metrics import SegmentationMetrics
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """The optimizer and its learning rate, per step: a linear warm-up, then half a cosine.
+
+    Attributes:
+        name: "sgd" or "adamw".
+        lr: learning rate behind the warm-up.
+        weight_decay: of weights; biases and norms have none.
+        momentum: of SGD.
+        warmup_steps: steps from 0 to lr, at most a tenth of the training.
+        final_fraction: share of lr left at the last step; 1 keeps it constant.
+    """
+
+    name: Literal["sgd", "adamw"] = "adamw"
+    lr: float = 2e-4
+    weight_decay: float = 0.05
+    momentum: float = 0.9
+    warmup_steps: int = 200
+    final_fraction: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.lr <= 0 or not 0 <= self.final_fraction <= 1:
+            raise ValueError(f"lr {self.lr} must be above 0 and final_fraction {self.final_fraction} in 0..1")
+
+    def factor(self, step: int, total: int) -> float:
+        """Share of lr at a step of `total`."""
+        warmup = min(self.warmup_steps, total // 10)
+        if step < warmup:
+            return (step + 1) / (warmup + 1)
+        done = min(1.0, (step - warmup) / max(1, total - warmup))
+        return self.final_fraction + (1 - self.final_fraction) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+_NETWORK = NetworkConfig()
+_OPTIMIZER = OptimizerConfig()
+
+
+class MaskRCNNModule(pl.LightningModule):
+    """Trains and scores an HDC Mask R-CNN with CQE.
+
+    Args:
+        class_names: name of label i + 1 at index i; the command line takes them from the data.
+        network: the network's shape.
+        optimizer: optimizer and schedule.
+        rescore: mask AP ranks by score * quality instead of by score.
+    """
+
+    def __init__(
+        self,
+        class_names: list[str],
+        network: NetworkConfig = _NETWORK,
+        optimizer: OptimizerConfig = _OPTIMIZER,
+        rescore: bool = True,
+    ) -> None:
+        super().__init__()
+        self.class_names = list(class_names)
+        self.network_config = _rebuild(NetworkConfig, network)
+        self.optimizer_config = _rebuild(OptimizerConfig, optimizer)
+        self.rescore = rescore
+        # Plain values only, so that a checkpoint loads under torch.load(weights_only=True).
+        self.save_hyperparameters(
+            {
+                "class_names": self.class_names,
+                "network": dataclasses.asdict(self.network_config),
+                "optimizer": dataclasses.asdict(self.optimizer_config),
+                "rescore": rescore,
+            }
+        )
+        self.network = MaskRCNN(len(self.class_names), self.network_config)
+        self._metrics: SegmentationMetrics | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> "MaskRCNNModule":
+        """A trained module in evaluation mode on the CPU, without fetching the weights its training started from.
+
+        Raises CohdcError naming the file when it is no checkpoint of this class.
+        """
+        try:
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+            values, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
+            network = NetworkConfig(**{**values["network"], "weights": None})
+            module = cls(values["class_names"], network, OptimizerConfig(**values["optimizer"]), values["rescore"])
+            module.load_state_dict(state)
+        except FileNotFoundError as error:
+            raise CohdcError(f"{path}: no such file") from error
+        except (OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+            reason = str(error).partition("\n")[0]
+            raise CohdcError(f"{path}: not a checkpoint of cohdc fit: {type(error).__name__}: {reason}") from error
+        return module.eval()
+
+    def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
+        """The sum of the losses. Raises CohdcError naming step and images when it is not finite."""
+        losses = self.network.losses(batch.images, batch.targets)
+        total = torch.stack([loss.float() for loss in losses.values()]).sum()
+        if not torch.isfinite(total):
+            ids = ", ".join(str(target["image_id"]) for target in batch.targets)
+            values = ", ".join(f"{name} {loss.item():.3g}" for name, loss in losses.items())
+            raise CohdcError(f"step {self.global_step}: the loss is not finite on images {ids}: {values}; lower the lr")
+        size = len(batch.targets)
+        self.log_dict({f"train/{name}": loss.detach() for name, loss in losses.items()}, batch_size=size)
+        self.log("train/loss", total.detach(), prog_bar=True, batch_size=size)
+        return total
+
+    def on_validation_epoch_start(self) -> None:
+        """Begin new scores."""
+        self._metrics = SegmentationMetrics(self._data().val_ground_truth(), self.rescore)
+
+    def validation_step(self, batch: list[ValSample], batch_idx: int) -> None:
+        """Collect the detections of the batch's images."""
+        assert self._metrics is not None
+        found = detect(self.network, [image for image, _ in batch])
+        for (_, image_id), detections in zip(batch, found, strict=True):
+            self._metrics.update(int(image_id), detections)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the scores under `val/`."""
+        assert self._metrics is not None
+        for name, value in self._metrics.compute().items():
+            self.log(f"val/{name}", value, prog_bar=name == "segm_AP50", sync_dist=True)
+        self._metrics = None
+
+    def configure_optimizers(self) -> Any:
+        """Optimizer over what is trained, and its schedule over the trainer's steps."""
+        config = self.optimizer_config
+        trained = [p for p in self.network.parameters() if p.requires_grad]
+        groups = [
+            {"params": [p for p in trained if p.ndim > 1], "weight_decay": config.weight_decay},
+            {"params": [p for p in trained if p.ndim <= 1], "weight_decay": 0.0},
+        ]
+        optimizer: torch.optim.Optimizer
+        if config.name == "sgd":
+            optimizer = torch.optim.SGD(groups, lr=config.lr, momentum=config.momentum)
+        else:
+            optimizer = torch.optim.AdamW(groups, lr=config.lr)
+        total = self.trainer.estimated_stepping_batches
+        if math.isinf(total):
+            raise CohdcError("the schedule needs an end: give trainer.max_epochs or trainer.max_steps")
+        schedule = LambdaLR(optimizer, lambda step: config.factor(step, int(total)))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another class map, before its weights are looked at."""
+        theirs = list(checkpoint.get("hyper_parameters", {}).get("class_names", []))
+        if theirs != self.class_names:
+            ours = ", ".join(self.class_names)
+            raise CohdcError(f"the checkpoint's classes are {', '.join(theirs)}; the data's are {ours}")
+
+    def _data(self) -> CocoDataModule:
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(data, CocoDataModule):
+            raise TypeError("MaskRCNNModule validates on a CocoDataModule only")
+        return data
+
+
+def _rebuild(kind: Any, value: Any) -> Any:
+    """A configuration from itself or from the plain dict a checkpoint holds."""
+    return kind(**value) if isinstance(value, dict) else value
