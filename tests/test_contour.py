@@ -1,0 +1,135 @@
+"""Outlines: exact tracing with parts and holes, the floor of IoU, the search that moves vertices."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cohdc_train.contour import BeetleSearch, Method, Polygon, rasterize, simplify, trace, vertices
+
+SIZE = (96, 128)
+SEEDS = st.integers(0, 2**32 - 1)
+FLOORS = st.sampled_from([0.8, 0.9, 0.95, 0.99, 1.0])
+
+
+def blob(seed: int, size: tuple[int, int] = SIZE) -> NDArray[np.bool_]:
+    """Smoothed noise above its 70th percentile: several parts with holes and bays."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=size), (0, 0), 6)
+    return np.asarray(noise > np.quantile(noise, 0.7))
+
+
+def iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def test_one_pixel_is_a_unit_square() -> None:
+    mask = np.zeros((5, 7), bool)
+    mask[2, 4] = True
+    (polygon,) = trace(mask)
+    assert {tuple(point) for point in polygon.outer.tolist()} == {(4, 2), (5, 2), (5, 3), (4, 3)}
+    assert polygon.holes == ()
+
+
+def test_ring_has_a_hole() -> None:
+    mask = np.ones((6, 6), bool)
+    mask[2:4, 1:5] = False
+    (polygon,) = trace(mask)
+    assert len(polygon.outer) == 4
+    (hole,) = polygon.holes
+    assert hole.min(0).tolist() == [1, 2]
+    assert hole.max(0).tolist() == [5, 4]
+    assert np.array_equal(rasterize([polygon], (6, 6)), mask)
+
+
+def test_empty_mask_has_no_outline() -> None:
+    assert trace(np.zeros(SIZE, bool)) == []
+    assert simplify([]) == []
+    assert not rasterize([], SIZE).any()
+
+
+@given(SEEDS, st.floats(0.05, 0.95))
+@settings(max_examples=60, deadline=None)
+def test_tracing_and_filling_gives_any_mask_back(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    mask = rng.random((int(rng.integers(1, 30)), int(rng.integers(1, 30)))) < share
+    assert np.array_equal(rasterize(trace(mask), mask.shape), mask)
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_keyhole_rings_fill_like_polygons_with_holes(seed: int) -> None:
+    polygons = trace(blob(seed))
+    joined = [Polygon(polygon.keyhole()) for polygon in polygons]
+    assert np.array_equal(rasterize(joined, SIZE), rasterize(polygons, SIZE))
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools under numpy 2
+def test_coco_tools_fill_our_rings_alike() -> None:
+    mask_tools = pytest.importorskip("pycocotools.mask", reason="pycocotools comes with the train extra")
+    mask = blob(3)
+    rings = [polygon.keyhole().ravel().tolist() for polygon in trace(mask)]
+    theirs = mask_tools.decode(mask_tools.merge(mask_tools.frPyObjects(rings, *SIZE)))
+    assert np.array_equal(theirs.astype(bool), mask)
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_filling_follows_pixel_centres(seed: int) -> None:
+    triangle = np.random.default_rng(seed).uniform(-5, 45, (3, 2))
+    filled = rasterize([Polygon(triangle)], (40, 40))
+    y, x = np.mgrid[:40, :40] + 0.5
+    sides = []
+    for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
+        sides.append((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]))
+    inside = (np.min(sides, axis=0) > 0) | (np.max(sides, axis=0) < 0)
+    assert np.array_equal(filled, inside)
+
+
+@given(SEEDS, FLOORS, st.sampled_from(["bisection", "bas_dp"]))
+@settings(max_examples=40, deadline=None)
+def test_floor_holds_and_vertices_fall(seed: int, floor: float, method: Method) -> None:
+    mask = blob(seed)
+    polygons = trace(mask)
+    simpler = simplify(polygons, floor, method, search=BeetleSearch(iterations=5))
+    assert iou(rasterize(simpler, SIZE), mask) >= floor
+    assert vertices(simpler) <= vertices(polygons)
+
+
+@given(SEEDS, st.integers(0, 20), st.integers(0, 20), st.sampled_from(["bisection", "dp", "bas_dp"]))
+@settings(max_examples=25, deadline=None)
+def test_a_moved_mask_has_the_moved_polygon(seed: int, dx: int, dy: int, method: Method) -> None:
+    mask = blob(seed)
+    moved = np.zeros((SIZE[0] + 20, SIZE[1] + 20), bool)
+    moved[dy : dy + SIZE[0], dx : dx + SIZE[1]] = mask
+    search = BeetleSearch(iterations=5)
+    here, there = (
+        simplify(trace(mask), method=method, search=search),
+        simplify(trace(moved), method=method, search=search),
+    )
+    assert len(here) == len(there)
+    for a, b in zip(here, there, strict=True):
+        for ring, moved_ring in zip(a.rings, b.rings, strict=True):
+            assert np.allclose(ring + np.array([dx, dy]), moved_ring, atol=1e-9)
+
+
+def test_beetles_need_fewer_vertices_than_bisection() -> None:
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    disc = (x - 60) ** 2 + (y - 48) ** 2 < 40**2
+    polygons = trace(disc)
+    bisected, searched = simplify(polygons, 0.97), simplify(polygons, 0.97, "bas_dp")
+    assert vertices(searched) < vertices(bisected) < vertices(polygons) / 4
+    assert iou(rasterize(searched, SIZE), disc) >= 0.97
+
+
+def test_same_seed_same_polygon() -> None:
+    polygons = trace(blob(4))
+    first, again = (simplify(polygons, 0.9, "bas_dp", search=BeetleSearch(seed=5)) for _ in range(2))
+    assert all(np.array_equal(a.outer, b.outer) for a, b in zip(first, again, strict=True))
+
+
+def test_fixed_tolerance_knows_no_floor() -> None:
+    polygons = trace(blob(5))
+    coarse, fine = simplify(polygons, 1.0, "dp", epsilon=6), simplify(polygons, 1.0, "dp", epsilon=1)
+    assert vertices(coarse) < vertices(fine) < vertices(polygons)
