@@ -16,6 +16,8 @@ from cohdc_train.slam.optimization import (
     residuals,
 )
 
+_BLAS_SERIAL = 200_000  # multiplications; OpenBLAS starts threads at 262144
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -55,7 +57,7 @@ class _Normal:
 def local_points(poses: Array, points: Array, problem: Problem) -> Array:
     """[m, 3] each measured point in the frame of the camera that saw it, m."""
     R, t = poses[problem.cameras, :3, :3], poses[problem.cameras, :3, 3]
-    return np.einsum("mij,mj->mi", R, points[problem.points]) + t
+    return np.asarray(np.einsum("mij,mj->mi", R, points[problem.points]) + t)
 
 
 def measurement_chi2(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Array:
@@ -134,7 +136,7 @@ def _add_camera(result: _Normal, slot: int, ids: NDArray[np.int64], terms: tuple
     by_pose, by_point, error = terms
     J = by_pose.reshape(-1, 6)
     result.camera[slot] = J.T @ J
-    result.camera_gradient[slot] = J.T @ error.reshape(-1)
+    result.camera_gradient[slot] = np.einsum("ma,m->a", J, error.reshape(-1))
     products = by_pose.transpose(0, 2, 1) @ by_point
     result.mixed[:, slot * 6 : slot * 6 + 6, ids] = products.transpose(2, 1, 0)
 
@@ -150,12 +152,25 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     reduced = np.zeros((c * 6, c * 6))
     for k in range(3):
         carried = sum(mixed[i] * inverse[:, i, k] for i in range(3))  # column k of mixed @ inverse
-        reduced -= carried @ mixed[k].T
-        right = right + carried @ normal.point_gradient[:, k]
+        reduced -= _product(carried, mixed[k])
+        right = right + np.einsum("ap,p->a", carried, normal.point_gradient[:, k])
     for slot in range(c):
         block = slice(slot * 6, slot * 6 + 6)
         reduced[block, block] += normal.camera[slot] + damping * np.diag(np.diag(normal.camera[slot]))
     reduced[np.diag_indices(c * 6)] += 1e-9
-    pose_step = np.linalg.solve(reduced, right)
-    back = -normal.point_gradient - np.stack([pose_step @ mixed[k] for k in range(3)], axis=1)
+    pose_step: Array = np.linalg.solve(reduced, right).astype(np.float64)
+    back = -normal.point_gradient - np.einsum("a,kap->pk", pose_step, mixed)
     return pose_step.reshape(c, 6), np.einsum("pij,pj->pi", inverse, back)
+
+
+def _product(first: Array, second: Array) -> Array:
+    """first @ second.T of two [a, p] arrays, in pieces that a BLAS does not split over threads.
+
+    Waiting for a second thread on a busy machine costs many times these products, and the order of sums stays the same.
+    """
+    total = np.zeros((len(first), len(second)))
+    width = max(_BLAS_SERIAL // (len(first) * len(second)), 1)
+    for start in range(0, first.shape[1], width):
+        piece = slice(start, start + width)
+        total += first[:, piece] @ second[:, piece].T
+    return total

@@ -39,7 +39,7 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """pixels: [n, 2] as measured in the image, px. Returns [n, 2] where a lens without distortion would put them."""
+        """pixels: [n, 2] as measured, px. Returns [n, 2] px where a lens without distortion would put them."""
         coefficients = np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
         if not coefficients.any() or len(pixels) == 0:
             return np.asarray(pixels, dtype=np.float64).copy()

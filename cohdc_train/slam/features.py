@@ -1,4 +1,4 @@
-"""ORB corners spread over the image, found only where nothing dynamic lies, with the depth readings that can be trusted."""
+"""ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that can be trusted."""
 
 from dataclasses import dataclass
 
@@ -53,7 +53,7 @@ class FeatureExtractor:
         self.camera = camera
         self.budget = budget
         pool = int(budget * _POOL)
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=pool,
             scaleFactor=SCALE,
             nlevels=LEVELS,
@@ -67,7 +67,7 @@ class FeatureExtractor:
     def __call__(
         self, rgb: NDArray[np.uint8], depth: NDArray[np.float32], mask: NDArray[np.bool_] | None = None
     ) -> Features:
-        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic (no corner is taken there)."""
+        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there."""
         gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found = self._orb.detect(gray, allowed)
@@ -99,7 +99,7 @@ def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:
     """groups: [n] sorted keys. Returns [n] 0, 1, 2, ... restarting at every new key."""
     index = np.arange(len(groups))
     starts = np.r_[True, groups[1:] != groups[:-1]][: len(groups)]
-    return index - np.maximum.accumulate(np.where(starts, index, 0))
+    return np.asarray(index - np.maximum.accumulate(np.where(starts, index, 0)), dtype=np.int64)
 
 
 def sample_depth(
@@ -130,4 +130,4 @@ def sample_depth(
 
 def hamming(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> NDArray[np.int64]:
     """first, second: [..., 4] descriptors. Returns [...] how many of the 256 bits differ."""
-    return np.bitwise_count(first ^ second).sum(axis=-1, dtype=np.int64)
+    return np.asarray(np.bitwise_count(first ^ second).sum(axis=-1, dtype=np.int64))

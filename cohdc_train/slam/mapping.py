@@ -1,4 +1,4 @@
-"""What happens when a keyframe joins the map: new points, duplicates merged, local bundle adjustment, weak points out."""
+"""What happens when a keyframe joins: new points, duplicates merged, local bundle adjustment, weak points out."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def add_points(world: Map, keyframe: Keyframe) -> None:
 
 
 def fuse(world: Map, keyframe: Keyframe) -> None:
-    """Look for the keyframe's points in its neighbours: more measurements, and duplicates merged into the older point."""
+    """Look for the keyframe's points in its neighbours: more measurements; duplicates become the older point."""
     neighbours = [k for k in world.covisible(keyframe.seen_points(), _FUSE_KEYFRAMES + 1) if k is not keyframe]
     for other in neighbours:
         ids = np.setdiff1d(keyframe.seen_points(), other.seen_points())

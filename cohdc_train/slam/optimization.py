@@ -1,6 +1,6 @@
 """Robust least squares on reprojection and depth: one camera's pose, and bundle adjustment with a Schur complement.
 
-A pose is T_cw: [4, 4] world to camera, m. It is updated from the left, T <- exp(xi) T with xi = (translation, rotation).
+A pose is T_cw: [4, 4] world to camera, m. It is updated from the left, T <- exp(xi) T, xi = (translation, rotation).
 The residual of an observation has three rows: both pixel coordinates and bf / z, a disparity that a baseline b would
 see, so that depth too is weighed in px. Rows of depth that were not measured weigh nothing.
 """
@@ -161,7 +161,9 @@ def _refine(T_cw: Array, points: Array, seen: Observations, weighing: Weighing, 
         weight[local[:, 2] <= _NEAR] = 0.0
         J = pose_jacobian(local, residual_jacobian(local, seen, weighing)).reshape(-1, 6)
         weighted = J * np.repeat(weight, 3)[:, None]
-        step = np.linalg.solve(J.T @ weighted + 1e-9 * np.eye(6), -weighted.T @ error.reshape(-1))
+        step = np.asarray(
+            np.linalg.solve(J.T @ weighted + 1e-9 * np.eye(6), -np.einsum("ma,m->a", weighted, error.reshape(-1)))
+        )
         T_cw = exp_se3(step) @ T_cw
         if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
             break

@@ -54,6 +54,7 @@ class Tracker:
     def __init__(self, camera: Camera, features: int = 1000, seed: int = 0) -> None:
         self.camera = camera
         self.map = Map(camera)
+        self.budget = features
         self.features: Features | None = None  # of the latest frame
         self._extract = FeatureExtractor(camera, features)
         self._weighing = Weighing(camera)
@@ -84,7 +85,7 @@ class Tracker:
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
-        T_wc = None if fit is None else np.linalg.inv(fit.T_cw)
+        T_wc = None if fit is None else np.linalg.inv(fit.T_cw).astype(np.float64)
         return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
 
     def trajectory(self) -> tuple[Array, Array]:

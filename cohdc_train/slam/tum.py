@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera
+from cohdc_train.trajectory import associate
 
 
 @dataclass(frozen=True)
@@ -47,42 +49,19 @@ class _Entry:
 def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
     """Read the two lists and pair them one to one, nearest stamps first, as TUM's associate tool does.
 
-    max_difference: s. Raises DataError naming file and line for a missing or broken list, or when nothing pairs.
+    max_difference: s. Raises DataError naming file and line for a missing or broken list, stamps that do not rise, an
+    image that is not there, or when nothing pairs.
     """
     colours = _read_list(folder / "rgb.txt")
     depths = _read_list(folder / "depth.txt")
     times = np.array([entry.t for entry in colours]), np.array([entry.t for entry in depths])
-    pairs = pair_stamps(times[0], times[1], max_difference)
+    pairs = associate(*times, max_difference).tolist()
     if not pairs:
         raise DataError(f"{folder}: no image of rgb.txt lies within {max_difference:g} s of one of depth.txt")
     frames = tuple(
         Frame(colours[i].t, colours[i].stamp, folder / colours[i].name, folder / depths[j].name) for i, j in pairs
     )
     return Sequence(folder, frames, len(colours) - len(frames))
-
-
-def pair_stamps(
-    first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
-) -> list[tuple[int, int]]:
-    """One-to-one pairs of indices, smallest difference first, sorted by the first; all stamps in s."""
-    if len(second) == 0:
-        return []
-    order = np.argsort(second, kind="stable")
-    stamps = second[order]
-    low = np.searchsorted(stamps, first - max_difference, side="left")
-    high = np.searchsorted(stamps, first + max_difference, side="right")
-    candidates = [
-        (abs(float(first[i] - second[j])), i, int(j)) for i in range(len(first)) for j in order[low[i] : high[i]]
-    ]
-    taken_first: set[int] = set()
-    taken_second: set[int] = set()
-    pairs: list[tuple[int, int]] = []
-    for _, i, j in sorted(candidates):
-        if i not in taken_first and j not in taken_second:
-            taken_first.add(i)
-            taken_second.add(j)
-            pairs.append((i, j))
-    return sorted(pairs, key=lambda pair: first[pair[0]])
 
 
 def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
@@ -108,7 +87,7 @@ def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
     return np.asarray(image > 0)
 
 
-def _decode(path: Path, flags: int) -> NDArray[np.generic]:
+def _decode(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
@@ -116,7 +95,7 @@ def _decode(path: Path, flags: int) -> NDArray[np.generic]:
     image = cv2.imdecode(data, flags) if len(data) else None
     if image is None:
         raise DataError(f"{path}: not an image that can be decoded ({len(data)} bytes)")
-    return np.asarray(image)
+    return cast("NDArray[np.uint8] | NDArray[np.uint16]", image)
 
 
 def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
@@ -143,6 +122,8 @@ def _read_list(path: Path) -> list[_Entry]:
             raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not a number") from error
         if not math.isfinite(stamp):
             raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not finite")
+        if entries and stamp <= entries[-1].t:
+            raise DataError(f"{path}:{number}: time stamp {words[0]} does not come after {entries[-1].stamp}")
         if not (path.parent / words[1]).is_file():
             raise DataError(f"{path}:{number}: {words[1]} does not exist in {path.parent}")
         entries.append(_Entry(stamp, words[0], words[1]))

@@ -1,0 +1,96 @@
+"""Masks of what moves: from a segmenter's ONNX or a folder of PNGs, dilated, True = dynamic."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.errors import DataError
+from cohdc_train.segmenter import Detections, Segmenter
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.tum import Frame, read_mask
+
+Mask = NDArray[np.bool_]
+MaskSource = Callable[[Frame, NDArray[np.uint8]], Mask | None]
+
+
+@dataclass(frozen=True)
+class Culling:
+    """How a frame's mask is made of what a segmenter or a folder gives.
+
+    Args:
+        dynamic_classes: names of the classes that may move; all classes of the model when not given.
+        score: detections below this class score are ignored.
+        dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (2 - q).
+    """
+
+    dynamic_classes: list[str] | None = None
+    score: float = 0.5
+    dilate: int = 10
+
+    def __post_init__(self) -> None:
+        if self.dilate < 0:
+            raise DataError(f"dilate is {self.dilate}; it cannot be below 0")
+        if not 0 <= self.score <= 1:
+            raise DataError(f"score is {self.score:g}; it must lie within 0..1")
+
+
+def grow(mask: Mask, radius: float) -> Mask:
+    """[H, W] bool, True within `radius` px of a True pixel of `mask`."""
+    if radius <= 0 or not mask.any():
+        return mask
+    distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(distance <= radius)
+
+
+def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Culling) -> Mask:
+    """The union of the dynamic objects' masks, each grown by dilate * (2 - quality) px.
+
+    A contour that CQE doubts gets a wider band; it is never left out, for a missed person costs more than lost corners.
+    Returns [H, W] bool, True = dynamic.
+    """
+    keep = (detections.scores >= culling.score) & np.isin(detections.labels, list(labels))
+    chosen = detections.select(keep)
+    union = np.zeros(detections.size, dtype=np.bool_)
+    for mask, quality in zip(chosen.masks(), chosen.quality, strict=True):
+        union |= grow(mask, culling.dilate * (2.0 - float(np.clip(quality, 0.0, 1.0))))
+    return union
+
+
+def no_masks(frame: Frame, rgb: NDArray[np.uint8]) -> Mask | None:
+    """The source for a world that stands still."""
+    return None
+
+
+class FolderMasks:
+    """PNGs that bear the names of the colour images; values above 0 are dynamic."""
+
+    def __init__(self, folder: Path, camera: Camera, culling: Culling) -> None:
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder of masks")
+        self._folder, self._camera, self._culling = folder, camera, culling
+
+    def __call__(self, frame: Frame, rgb: NDArray[np.uint8]) -> Mask:
+        """[H, W] bool. Raises DataError when the frame's mask is missing: a missed person would spoil the map."""
+        mask = read_mask(self._folder / f"{frame.rgb.stem}.png", self._camera)
+        return grow(mask, self._culling.dilate)
+
+
+class ModelMasks:
+    """Every frame goes through the segmenter; raises DataError for a class that the model does not know."""
+
+    def __init__(self, segmenter: Segmenter, culling: Culling) -> None:
+        names = segmenter.class_names
+        wanted = names if culling.dynamic_classes is None else culling.dynamic_classes
+        unknown = [name for name in wanted if name not in names]
+        if unknown:
+            raise DataError(f"dynamic class {unknown[0]!r} is not one of the model's: {', '.join(names)}")
+        self._labels = frozenset(names.index(name) for name in wanted)
+        self._segmenter, self._culling = segmenter, culling
+
+    def __call__(self, frame: Frame, rgb: NDArray[np.uint8]) -> Mask:
+        """[H, W] bool."""
+        return dynamic_mask(self._segmenter(rgb), self._labels, self._culling)

@@ -1,0 +1,160 @@
+"""`cohdc slam`: an RGB-D sequence in, a trajectory and its scores out."""
+
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cohdc_train import __version__
+from cohdc_train.errors import DataError
+from cohdc_train.slam.camera import Camera, choose_camera
+from cohdc_train.slam.culling import Culling, FolderMasks, MaskSource, ModelMasks, no_masks
+from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.results import (
+    FrameRecord,
+    check_out,
+    draw_after,
+    draw_before,
+    measure,
+    publish,
+    write_jpeg,
+    write_run,
+)
+from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.tum import Frame, Sequence, read_depth, read_rgb, read_sequence
+from cohdc_train.trajectory import Trajectory
+
+_PICTURES = 6
+
+
+def slam(
+    *,
+    sequence: Path,
+    out: Path,
+    model: Path | None = None,
+    masks: Path | None = None,
+    camera: Path | None = None,
+    seed: int = 0,
+    features: int = 1000,
+    culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
+) -> dict[str, Any]:
+    """Track an RGB-D camera through a TUM-format sequence; people are removed when masks or a model are given.
+
+    Writes trajectory.txt (TUM format, every tracked frame), metrics.json, frames.csv, config.yaml and pictures/ into
+    the output folder, and returns the metrics. Raises DataError, naming file and line, for input that cannot be used.
+
+    Args:
+        sequence: folder with rgb.txt, depth.txt and their images; groundtruth.txt is used for scores when there.
+        out: folder for the results; files of a former run are replaced.
+        model: ONNX written by `cohdc export`; every frame is segmented.
+        masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
+        camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
+        seed: of the random samples; the same seed gives the same numbers.
+        features: corners per frame.
+        culling: how masks are made.
+    """
+    if model is not None and masks is not None:
+        raise DataError("give --model or --masks, not both")
+    check_out(out)
+    intrinsics, origin = choose_camera(sequence, camera)
+    pairs = read_sequence(sequence)
+    source = _mask_source(model, masks, intrinsics, culling)
+    print(f"camera: {origin}")
+    print(
+        f"sequence: {len(pairs.frames)} pairs; {pairs.without_depth} colour images have no depth image and are left out"
+    )
+    options = {"model": model, "masks": masks, "sequence": sequence, "seed": seed, "features": features}
+    config: dict[str, Any] = {key: str(v) if isinstance(v, Path) else v for key, v in options.items()}
+    config |= {"culling": asdict(culling), "camera": intrinsics.as_dict(), "camera_origin": origin}
+    config |= {"version": __version__}
+    with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+        part = Path(folder)
+        tracker = Tracker(intrinsics, features, seed)
+        records = _run(tracker, pairs, source, part)
+        trajectory = Trajectory(*tracker.trajectory())
+        metrics = {"seed": seed, "without_depth": pairs.without_depth}
+        metrics |= measure(records, trajectory, pairs.groundtruth)
+        write_run(part, records, trajectory, metrics, config)
+        publish(part, out)
+    print(summary(metrics))
+    print(f"written to {out}")
+    return metrics
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """The small table at the end of a run."""
+    rows = [
+        ("frames", f"{metrics['tracked']} of {metrics['frames']} tracked ({100 * metrics['coverage']:.1f} %)"),
+        ("keyframes", str(metrics["keyframes"])),
+        ("frames/s", f"{metrics['fps']:.1f}"),
+    ]
+    rows += [(f"{stage} ms", f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for stage, q in metrics["ms"].items()]
+    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
+        if key in metrics:
+            rows.append((key, "  ".join(f"{name} {value:.4f}" for name, value in metrics[key].items())))
+    return "\n".join(f"  {name:<16}{text}" for name, text in rows)
+
+
+def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:
+    if masks is not None:
+        return FolderMasks(masks, camera, culling)
+    if model is None:
+        return no_masks
+    from cohdc_train.segmenter import Segmenter
+
+    return ModelMasks(Segmenter(model), culling)
+
+
+def _run(tracker: Tracker, sequence: Sequence, source: MaskSource, part: Path) -> list[FrameRecord]:
+    (part / "pictures").mkdir()
+    count = len(sequence.frames)
+    pictured = set(np.linspace(0, count - 1, min(_PICTURES, count)).round().astype(int).tolist())
+    records = []
+    for index, frame in enumerate(sequence.frames):
+        records.append(_step(tracker, frame, source, part / "pictures" if index in pictured else None))
+        _progress(index + 1, count, records[-1])
+    return records
+
+
+def _step(tracker: Tracker, frame: Frame, source: MaskSource, pictures: Path | None) -> FrameRecord:
+    """One frame; when it is to be pictured, the drawing stays outside the measured time."""
+    rgb, depth = read_rgb(frame.rgb, tracker.camera), read_depth(frame.depth, tracker.camera)
+    start = time.perf_counter()
+    mask = source(frame, rgb)
+    segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
+    pose = tracker.track(rgb, depth, frame.t, mask)
+    if pictures is not None and tracker.features is not None:
+        unmasked = FeatureExtractor(tracker.camera, tracker.budget)(rgb, depth)
+        write_jpeg(pictures / f"{frame.stamp}_before.jpg", draw_before(rgb, unmasked, mask))
+        if mask is not None:
+            write_jpeg(pictures / f"{frame.stamp}_after.jpg", draw_after(rgb, tracker.features, mask))
+    return FrameRecord(frame.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms)
+
+
+def _progress(done: int, count: int, record: FrameRecord) -> None:
+    """One line that renews itself on a terminal; elsewhere a line per tenth."""
+    state = f"{record.pose.inliers} inliers" if record.pose.tracked else "lost"
+    line = f"frame {done}/{count}  {state}"
+    if sys.stderr.isatty():
+        print(f"\r{line:<50}", end="\n" if done == count else "", file=sys.stderr, flush=True)
+    elif done * 10 // count > (done - 1) * 10 // count:
+        print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV on one thread with a fixed seed: the order of its sums cannot change from run to run."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,112 @@
+"""A cheap world for tests: textured rectangles seen by a pinhole camera, colour and depth exact to the pixel."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.optimization import exp_se3
+from cohdc_train.trajectory import Trajectory, write_tum
+from numpy.typing import NDArray
+
+CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
+CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\ndepth_scale: 5000\n"
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """origin, across, down: [3] m: a corner and the two edges; texture: [h, w, 3] uint8; moving: what a mask covers."""
+
+    origin: NDArray[np.float64]
+    across: NDArray[np.float64]
+    down: NDArray[np.float64]
+    texture: NDArray[np.uint8]
+    moving: bool = False
+
+
+def texture(rng: np.random.Generator, height: int, width: int, patches: int = 900) -> NDArray[np.uint8]:
+    """Overlapping patches of random grey and colour: corners everywhere, no two alike."""
+    image = np.full((height, width, 3), 120, dtype=np.uint8)
+    for _ in range(patches):
+        x, y = int(rng.integers(width)), int(rng.integers(height))
+        w, h = (int(v) for v in rng.integers(6, 40, size=2))
+        colour = tuple(int(v) for v in rng.integers(0, 256, size=3))
+        cv2.rectangle(image, (x, y), (x + w, y + h), colour, -1)
+    return cv2.GaussianBlur(image, (3, 3), 0)
+
+
+def room(seed: int = 0) -> list[Rectangle]:
+    """A wall 2.6 m away, a floor, and a box standing before them."""
+    rng = np.random.default_rng(seed)
+    return [
+        Rectangle(np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 3.0, 0]), texture(rng, 600, 1200)),
+        Rectangle(np.array([-3.0, 1.0, 0.5]), np.array([6.0, 0, 0]), np.array([0, 0, 2.1]), texture(rng, 420, 1200)),
+        Rectangle(np.array([0.2, -0.1, 1.9]), np.array([0.7, 0, 0.1]), np.array([0, 0.8, 0]), texture(rng, 240, 200)),
+    ]
+
+
+def passer_by(step: int, seed: int = 7) -> Rectangle:
+    """A textured board before the camera that goes along with step: the worst kind of mover, full of corners."""
+    left = -1.3 + 0.035 * step
+    rng = np.random.default_rng(seed)
+    board = texture(rng, 300, 240, patches=500)
+    return Rectangle(np.array([left, -0.7, 1.2]), np.array([0.9, 0, 0]), np.array([0, 1.4, 0]), board, moving=True)
+
+
+def camera_path(frames: int) -> NDArray[np.float64]:
+    """[frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees."""
+    s = np.arange(frames) / 40.0 * 2 * np.pi
+    xi = np.stack([0.25 * np.sin(s), 0.1 * np.sin(2 * s), 0.12 * (1 - np.cos(s))], axis=1)
+    turn = np.stack([0.04 * np.sin(s), 0.08 * (1 - np.cos(s)), 0.05 * np.sin(2 * s)], axis=1)
+    return exp_se3(np.concatenate([xi, turn], axis=1))
+
+
+def render(
+    rectangles: list[Rectangle], T_wc: NDArray[np.float64], camera: Camera = CAMERA
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    """Colour [H, W, 3], depth [H, W] m (0 where nothing is hit), and where moving things are seen [H, W]."""
+    T_cw = np.linalg.inv(T_wc)
+    size = (camera.width, camera.height)
+    rgb = np.full((camera.height, camera.width, 3), 90, dtype=np.uint8)
+    nearest = np.full((camera.height, camera.width), np.inf)
+    moving = np.zeros((camera.height, camera.width), dtype=np.bool_)
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    for item in rectangles:
+        origin = T_cw[:3, :3] @ item.origin + T_cw[:3, 3]
+        across, down = T_cw[:3, :3] @ item.across, T_cw[:3, :3] @ item.down
+        normal = np.cross(across, down)
+        depth = (normal @ origin) / (rays @ normal)
+        local = rays * depth[..., None] - origin
+        a, b = local @ across / (across @ across), local @ down / (down @ down)
+        height, width = item.texture.shape[:2]
+        map_u, map_v = (a * width - 0.5).astype(np.float32), (b * height - 0.5).astype(np.float32)
+        seen = (a >= 0) & (a < 1) & (b >= 0) & (b < 1) & (depth > 0.1) & (depth < nearest)
+        sampled = cv2.remap(item.texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        rgb[seen], nearest[seen], moving[seen] = sampled[seen], depth[seen], item.moving
+    assert rgb.shape[:2] == size[::-1]
+    return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
+
+
+def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> Path:
+    """A TUM folder of the room with masks/, camera.yaml and groundtruth.txt; 30 frames/s, depth 5 ms after colour."""
+    for name in ("rgb", "depth", "masks"):
+        (folder / name).mkdir(parents=True)
+    poses, rectangles = camera_path(frames), room()
+    rows: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for index, pose in enumerate(poses):
+        rgb, depth, moving = render([*rectangles, passer_by(index)] if with_passer_by else rectangles, pose)
+        stamp = f"{100 + index / 30:.6f}"
+        later = f"{100.005 + index / 30:.6f}"
+        cv2.imwrite(str(folder / "rgb" / f"{stamp}.png"), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(folder / "depth" / f"{later}.png"), (depth * 5000).round().astype(np.uint16))
+        cv2.imwrite(str(folder / "masks" / f"{stamp}.png"), moving.astype(np.uint8) * 255)
+        rows["rgb"].append(f"{stamp} rgb/{stamp}.png")
+        rows["depth"].append(f"{later} depth/{later}.png")
+    for name, lines in rows.items():
+        (folder / f"{name}.txt").write_text("# stamp file\n" + "\n".join(lines) + "\n")
+    (folder / "camera.yaml").write_text(CAMERA_YAML)
+    stamps = np.array([float(line.split()[0]) for line in rows["rgb"]])
+    write_tum(folder / "groundtruth.txt", Trajectory(stamps, poses))
+    return folder

@@ -1,0 +1,109 @@
+"""The tracker on worlds whose every pose is known."""
+
+import numpy as np
+import pytest
+from cohdc_train.slam.features import Features
+from cohdc_train.slam.matching import Matches, Projected, match_projected, one_to_one
+from cohdc_train.slam.tracking import Pose, Tracker
+from cohdc_train.trajectory import Trajectory, score
+from numpy.typing import NDArray
+from plane_world import CAMERA, camera_path, passer_by, render, room
+
+BLACK = np.zeros((240, 320, 3), dtype=np.uint8)
+NOTHING = np.zeros((240, 320), dtype=np.float32)
+
+
+def ate(tracker: Tracker, truth: NDArray[np.float64]) -> float:
+    """RMSE, m."""
+    stamps = np.arange(len(truth)) / 30
+    return score(Trajectory(stamps, truth), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"]
+
+
+def run(frames: int, mover: bool = False, masked: bool = False, seed: int = 0) -> tuple[Tracker, list[Pose]]:
+    tracker, world, poses = Tracker(CAMERA, features=500, seed=seed), room(), []
+    for index, T_wc in enumerate(camera_path(frames)):
+        rgb, depth, moving = render([*world, passer_by(index)] if mover else world, T_wc)
+        poses.append(tracker.track(rgb, depth, index / 30, moving if masked else None))
+    return tracker, poses
+
+
+def test_every_frame_of_a_still_room_is_tracked_to_millimetres() -> None:
+    tracker, poses = run(45)
+    assert all(pose.tracked for pose in poses)
+    assert 2 <= len(tracker.map.keyframes) < 30
+    assert ate(tracker, camera_path(45)) < 0.004
+    np.testing.assert_array_equal(poses[0].T_wc, np.eye(4))
+
+
+def test_a_mask_saves_the_trajectory_from_a_passer_by() -> None:
+    with_mask, poses = run(36, mover=True, masked=True)
+    without, _ = run(36, mover=True)
+    good, bad = ate(with_mask, camera_path(36)), ate(without, camera_path(36))
+    assert all(pose.tracked for pose in poses)
+    assert good < 0.006
+    assert bad > 5 * good
+
+
+def test_same_seed_same_bits() -> None:
+    first, second = (run(15, seed=3)[0].trajectory()[1] for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+
+
+def test_the_place_is_found_again_after_a_black_out() -> None:
+    tracker, world, path = Tracker(CAMERA, features=500), room(), camera_path(40)
+    views = [render(world, T_wc)[:2] for T_wc in path]
+    states = []
+    for index in range(40):
+        rgb, depth = (BLACK, NOTHING) if 15 <= index < 22 else views[index]
+        states.append(tracker.track(rgb, depth, index / 30).tracked)
+    assert all(states[:15])
+    assert not any(states[15:22])
+    assert all(states[22:]), "the camera moved on by seven frames in the dark and must still be found"
+    stamps, _ = tracker.trajectory()
+    assert len(stamps) == 33, "lost frames have no pose"
+    assert ate(tracker, path) < 0.005
+
+
+def test_nothing_to_see_is_lost_not_guessed() -> None:
+    tracker = Tracker(CAMERA)
+    pose = tracker.track(BLACK, NOTHING, 0.0)
+    assert not pose.tracked
+    assert pose.T_wc is None
+    assert tracker.trajectory()[1].shape == (0, 4, 4)
+
+
+def test_a_frame_wholly_under_its_mask_is_lost() -> None:
+    tracker = Tracker(CAMERA, features=500)
+    rgb, depth, _ = render(room(), np.eye(4))
+    assert not tracker.track(rgb, depth, 0.0, np.ones((240, 320), dtype=np.bool_)).tracked
+    assert tracker.track(rgb, depth, 0.1).tracked
+
+
+def features_at(points: list[tuple[float, float]], words: list[int], octaves: list[int]) -> Features:
+    pixels = np.array(points, dtype=np.float64)
+    descriptors = np.zeros((len(words), 4), dtype=np.uint64)
+    descriptors[:, 0] = words
+    return Features(pixels, pixels, np.array(octaves), descriptors, np.ones(len(words)))
+
+
+@pytest.mark.parametrize(
+    ("corner", "octave", "word", "found"),
+    [((52.0, 40.0), 0, 0b0, True), ((59.0, 40.0), 0, 0b0, False), ((52.0, 40.0), 2, 0b0, False)],
+    ids=["near", "too far", "other level"],
+)
+def test_matching_by_projection(corner: tuple[float, float], octave: int, word: int, found: bool) -> None:
+    features = features_at([corner], [word], [octave])
+    projected = Projected(
+        np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64)
+    )
+    matches = match_projected(projected, features, radius=5.0)
+    assert matches.points.tolist() == ([77] if found else [])
+
+
+def test_matches_are_one_to_one_and_clear() -> None:
+    # point 0 likes corner 0 best; point 1 likes it too but less; point 2 cannot tell corners 1 and 2 apart
+    i, j, bits = np.array([0, 0, 1, 2, 2]), np.array([0, 1, 0, 1, 2]), np.array([10, 60, 20, 30, 31])
+    points, corners = one_to_one(i, j, bits, ratio=0.9)
+    assert points.tolist() == [0]
+    assert corners.tolist() == [0]
+    assert len(Matches(points, corners)) == 1
