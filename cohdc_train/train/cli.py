@@ -20,9 +20,18 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path
 from cohdc_train.train.module import MaskRCNNModule
 
+_USAGE = "cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR] [--print_config] [--OPTION VALUE ...]"
+_DESCRIPTION = "Train an HDC Mask R-CNN with CQE on COCO-format data."
 _BEST = "val/segm_AP"
-# Lightning's advice that does not apply: how many workers to use is the user's choice, and says so in the help.
-_ADVICE = (".*does not have many workers.*", ".*is smaller than the logging interval.*", ".*Checkpoint directory.*")
+# Lightning's advice that does not apply here, and what its own code is told off for by newer packages.
+_ADVICE = (
+    ".*does not have many workers.*",
+    ".*is smaller than the logging interval.*",
+    ".*Checkpoint directory.*",
+    ".*args parameter is intended to run from within Python.*",
+    r".*isinstance\(treespec, LeafSpec\).*",
+    r"(?s).*(JSONARGPARSE_DEPRECATION_WARNINGS|was\s+deprecated\s+in\s+v4).*",
+)
 
 
 def fit(args: list[str]) -> Trainer:
@@ -41,7 +50,8 @@ def fit(args: list[str]) -> Trainer:
             save_config_callback=_SaveConfig,
             save_config_kwargs={"overwrite": True, "save_to_log_dir": False},
             trainer_defaults={"max_epochs": 12, "gradient_clip_val": 5.0, "log_every_n_steps": 10},
-            parser_kwargs={"prog": "cohdc fit", "description": "Train an HDC Mask R-CNN with CQE on COCO-format data."},
+            parser_kwargs={"prog": "cohdc fit", "usage": _USAGE, "description": _DESCRIPTION},
+            auto_configure_optimizers=False,
         )
         command.run()
     return command.trainer
@@ -109,6 +119,13 @@ class FitCommand(LightningCLI):
         parser.link_arguments("out", "trainer.default_root_dir")
         parser.link_arguments("data.canvas", "model.network.canvas")
         parser.link_arguments("data.class_names", "model.class_names", apply_on="instantiate")
+
+    def instantiate_classes(self) -> None:
+        """Data, network and trainer; a value that one of them refuses is the user's error."""
+        try:
+            super().instantiate_classes()
+        except (ValueError, TypeError, FileNotFoundError) as error:
+            raise CohdcError(" ".join(str(error).split())) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer with CSV and TensorBoard logs below `--out` and a rich progress bar, unless told otherwise."""

@@ -1,0 +1,171 @@
+"""`cohdc fit` and `cohdc validate` on six drawn images with a tiny network."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
+import coco_toys
+
+from cohdc_train.cli import main
+from cohdc_train.errors import CohdcError
+from cohdc_train.train.cli import fit
+from cohdc_train.train.module import MaskRCNNModule
+
+TINY = """
+data: {canvas: [48, 64], workers: 0}
+model:
+  network: {depth: 18, width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16,
+            proposals: [50, 20]}
+trainer: {accelerator: cpu, max_epochs: 1, enable_model_summary: false}
+"""
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = coco_toys.folder(tmp_path_factory.mktemp("toy"))
+    (root / "tiny.yaml").write_text(TINY, encoding="utf-8")
+    return root
+
+
+def arguments(toy: Path, out: Path, *more: str) -> list[str]:
+    return ["--config", str(toy / "tiny.yaml"), f"--data.root={toy}", f"--out={out}", *more]
+
+
+@pytest.fixture(scope="module")
+def run(toy: Path) -> Path:
+    out = toy / "run"
+    fit(arguments(toy, out))
+    return out
+
+
+def test_a_fit_leaves_checkpoints_logs_and_its_configuration(run: Path) -> None:
+    assert {"best.ckpt", "last.ckpt", "config.yaml", "logs"} <= {path.name for path in run.iterdir()}
+    (log,) = (run / "logs").glob("*/metrics.csv")
+    header = log.read_text().splitlines()[0].split(",")
+    wanted = {
+        "val/segm_AP",
+        "val/segm_AP50",
+        "val/segm_AP70",
+        "val/box_AP",
+        "val/mIoU",
+        "val/S90_matched",
+        "val/S90_all",
+    }
+    assert wanted <= set(header)
+    assert list((run / "logs").glob("*/events.out.tfevents*"))
+
+
+def test_the_saved_configuration_is_whole_and_runs_again(toy: Path, run: Path) -> None:
+    saved = yaml.safe_load((run / "config.yaml").read_text())
+    assert saved["data"]["root"] == str(toy)
+    assert saved["model"]["optimizer"]["name"] == "adamw"
+    again = toy / "again"
+    fit(["--config", str(run / "config.yaml"), f"--out={again}"])
+    weights = [torch.load(r / "last.ckpt", weights_only=True)["state_dict"] for r in (run, again)]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_a_checkpoint_loads_without_the_weights_it_started_from(run: Path) -> None:
+    checkpoint = torch.load(run / "best.ckpt", weights_only=True)
+    checkpoint["hyper_parameters"]["network"]["weights"] = "/not/there.pt"
+    torch.save(checkpoint, run / "moved.ckpt")
+    module = MaskRCNNModule.load(run / "moved.ckpt")
+    assert module.class_names == ["person", "car"]
+    assert module.network_config.canvas == (48, 64)
+    assert not module.training
+    theirs = MaskRCNNModule.load_from_checkpoint(run / "best.ckpt", weights_only=True)
+    assert theirs.network_config.depth == module.network_config.depth
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", None])
+def test_what_is_no_checkpoint_is_told_in_one_line(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "some.ckpt"
+    if content is None:
+        torch.save({"weights": torch.zeros(1)}, path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(CohdcError, match=r"some\.ckpt: not a checkpoint of cohdc fit") as error:
+        MaskRCNNModule.load(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("ignore:The dirpath has changed")  # a true warning, and here the intention
+def test_training_resumes_with_more_epochs(toy: Path, run: Path) -> None:
+    trainer = fit(arguments(toy, toy / "resumed", "--trainer.max_epochs=2", f"--ckpt_path={run / 'last.ckpt'}"))
+    assert (trainer.current_epoch, trainer.global_step) == (2, 6)
+
+
+def test_a_changed_class_map_is_refused(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["fit", *arguments(toy, toy / "no", "--data.classes=[car]", f"--ckpt_path={run / 'last.ckpt'}")])
+    assert code == 1
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "cohdc fit: the checkpoint's classes are person, car; the data's are car"
+    )
+
+
+def test_validate_prints_and_writes_the_scores(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = toy / "scores.json"
+    assert main(["validate", str(run / "last.ckpt"), str(toy), "--workers=0", f"--out={out}"]) == 0
+    assert {"segm_AP50", "box_AP", "S90_all"} <= set(json.loads(out.read_text()))
+    assert "segm_AP50" in capsys.readouterr().out
+
+
+def test_half_precision_trains(toy: Path) -> None:
+    trainer = fit(arguments(toy, toy / "bf16", "--trainer.precision=bf16-mixed", "--data.batch_size=3"))
+    assert trainer.global_step == 2
+
+
+def test_a_diverged_loss_names_step_and_images(toy: Path) -> None:
+    with pytest.raises(CohdcError, match=r"^step \d+: the loss is not finite on images \d+, \d+:.*lower the lr$"):
+        fit(arguments(toy, toy / "nan", "--model.optimizer.lr=1e30", "--trainer.max_epochs=5"))
+
+
+def test_an_unreadable_image_is_told_in_one_line_from_a_worker(tmp_path: Path) -> None:
+    root = coco_toys.folder(tmp_path)
+    (root / "tiny.yaml").write_text(TINY, encoding="utf-8")
+    for path in (root / "images").glob("train_*"):
+        path.write_bytes(b"not an image")
+    with pytest.raises(CohdcError, match=r"^\S+train_\d\.png: image \d cannot be read as an image$"):
+        fit(arguments(root, tmp_path / "out", "--data.workers=1", "--trainer.limit_val_batches=0"))
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--model.network.rates=[[2],[1],[1],[1]]"], "holes"),
+        (["--model.network.weights=nowhere.pt"], "nowhere.pt"),
+        (["--model.network.anchor_scales=[8]"], "anchor_scales"),
+        (["--data.classes=[dog]"], "'dog'"),
+        (["--ckpt_path=nowhere.ckpt"], "nowhere.ckpt"),
+        (["--config=table3/test99.yaml"], "test99.yaml"),
+    ],
+)
+def test_bad_values_are_told_in_one_line(
+    toy: Path, more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", *arguments(toy, toy / "bad", *more)]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("cohdc fit: ")
+    assert message in last
+
+
+@pytest.mark.parametrize("wrong", ["--data.rot=x", "--model.network.canvas=[1,2]", "--data.batch_size=two"])
+def test_a_wrong_key_or_type_is_a_usage_error(toy: Path, wrong: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        fit(arguments(toy, toy / "bad", wrong))
+    assert stop.value.code == 2
+
+
+def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        fit(["--print_config"])
+    assert stop.value.code == 0
+    shown: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
+    assert shown["data"]["canvas"] == [800, 1024]
+    assert shown["checkpoint"]["monitor"] == "val/segm_AP"
