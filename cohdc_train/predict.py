@@ -95,12 +95,13 @@ def predict_pictures(
     for image_id, picture in enumerate(pictures, start=1):
         found = _kept(network(picture.rgb), *least)
         outlines = [simplify(trace(mask), iou_floor) for mask in found.masks()]
+        found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
+        outlines = [outline for outline in outlines if outline]
         height, width = picture.rgb.shape[:2]
         images.append({"id": image_id, "file_name": picture.name, "width": width, "height": height})
         for row, outline in enumerate(outlines):
-            if outline:
-                entry = {"id": len(annotations) + 1, "image_id": image_id, "file_name": picture.name}
-                annotations.append(entry | _annotation(found, row, outline))
+            entry = {"id": len(annotations) + 1, "image_id": image_id, "file_name": picture.name}
+            annotations.append(entry | _annotation(found, row, outline))
         _write(out / picture.overlay, _jpeg(draw(picture.rgb, found, outlines)))
     result = {"images": images, "categories": categories, "annotations": annotations}
     _write(out / "predictions.json", json.dumps(result).encode())

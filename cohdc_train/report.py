@@ -1,0 +1,260 @@
+"""A run's files -> one HTML page that needs nothing beside itself: pictures, plots and tables are inside it."""
+
+import base64
+import html
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.errors import DataError
+from cohdc_train.trajectory import Trajectory, align_umeyama, match, read_tum
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCORES = ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m")
+_COLOURS = ("#c0392b", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")  # of the runs, in their order
+_LOST_AFTER_S = 0.5  # a longer pause between two poses is left open in a plot
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #222 }
+h1, h2, h3 { line-height: 1.2 } table { border-collapse: collapse; margin: .5rem 0 1.5rem }
+th, td { padding: .2rem .8rem; border-bottom: 1px solid #ddd; text-align: right; font-variant-numeric: tabular-nums }
+th:first-child, td:first-child { text-align: left } thead th { border-bottom: 2px solid #888 }
+figure { margin: 0 } figcaption { color: #666; font-size: .85rem } img { max-width: 100%; display: block }
+.grid { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: .8rem; margin-bottom: 1.5rem }
+"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page: a title, the words of the head and of the rows. Raises ValueError for an uneven row."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def __post_init__(self) -> None:
+        if any(len(row) != len(self.head) for row in self.rows):
+            raise ValueError(f"table {self.title!r}: a row has not the {len(self.head)} cells of its head")
+
+    def html(self) -> str:
+        """The table as HTML, every word escaped."""
+        head = "".join(f"<th>{html.escape(word)}</th>" for word in self.head)
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(word)}</td>" for word in row) + "</tr>\n" for row in self.rows
+        )
+        return (
+            f"<h3>{html.escape(self.title)}</h3>\n<table><thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
+        )
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One SLAM run. truth, estimate: matched poses, the estimate aligned to the truth; None when too few matched."""
+
+    label: str
+    folder: Path
+    metrics: dict[str, Any]
+    truth: Trajectory | None
+    estimate: Trajectory | None
+
+
+def write_report(
+    out: Path,
+    title: str,
+    groundtruth: Path,
+    runs: Mapping[str, Path],
+    overlays: Sequence[Path] = (),
+    tables: Sequence[Table] = (),
+) -> None:
+    """Write one self-contained HTML page about SLAM runs on a sequence.
+
+    out: the HTML file, written whole or not at all; groundtruth: TUM file; runs: label -> folder written by `slam`
+    (trajectory.txt, metrics.json, pictures/<stamp>_before.jpg and _after.jpg); overlays: JPEG or PNG images of
+    predicted masks; tables: shown first. Sections without content are left out.
+    Raises DataError naming a file of a run or an image that cannot be used.
+    """
+    truth = read_tum(groundtruth)
+    loaded = [_load(label, folder, truth) for label, folder in runs.items()]
+    parts = [table.html() for table in (*tables, *_metric_tables(loaded))]
+    aligned = [run for run in loaded if run.estimate is not None]
+    if aligned:
+        parts.append("<h2>Trajectory against ground truth</h2>")
+        parts.append(_svg(_plot_paths(truth, aligned), "seen from above and from the side, after rigid alignment"))
+        parts.append(_svg(_plot_over_time(truth, aligned), "position over time"))
+        parts.append("<h2>Absolute trajectory error over time</h2>")
+        parts.append(
+            _svg(_plot_errors(truth, aligned), "distance to ground truth of every matched pose, after alignment")
+        )
+    if overlays:
+        parts.append(f"<h2>Predicted masks</h2>\n{_grid([(file, file.stem) for file in overlays])}")
+    pictures = [item for run in loaded for item in _pictures(run)]
+    if pictures:
+        parts.append("<h2>Features before and after culling</h2>")
+        parts.append("<p>Before: every corner, red on a mask. After: the corners that were used, masks outlined.</p>")
+        parts.append(_grid(pictures))
+    _write(out, title, parts)
+
+
+def _write(out: Path, title: str, parts: Sequence[str]) -> None:
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
+    body = "\n".join([f"<h1>{html.escape(title)}</h1>", *parts])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(out.name + ".part")
+    temporary.write_text(
+        f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n', "utf-8"
+    )
+    os.replace(temporary, out)
+
+
+def _load(label: str, folder: Path, truth: Trajectory) -> _Run:
+    file = folder / "metrics.json"
+    try:
+        metrics = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{file}: cannot be read as metrics: {error}") from error
+    if metrics.get("coverage") == 0:  # a tracker that was never on its way has no pose to plot
+        return _Run(label, folder, metrics, None, None)
+    estimate = read_tum(folder / "trajectory.txt")
+    try:
+        matched_truth, matched = match(truth, estimate)
+    except DataError:
+        return _Run(label, folder, metrics, None, None)
+    T = align_umeyama(matched.positions, matched_truth.positions)
+    return _Run(label, folder, metrics, matched_truth, matched.moved(T))
+
+
+# ---- tables
+
+
+def _metric_tables(runs: Sequence[_Run]) -> list[Table]:
+    scored = [(key, run) for key in SCORES for run in runs if key in run.metrics]
+    result = []
+    if scored:
+        names = list(scored[0][1].metrics[scored[0][0]])
+        rows = [[key, run.label, *(f"{run.metrics[key][name]:.4f}" for name in names)] for key, run in scored]
+        result.append(Table("Trajectory scores", ["score", "run", *names], rows))
+    rows = []
+    for run in runs:
+        coverage = f"{100 * run.metrics['coverage']:.1f} %"
+        for stage, time in run.metrics.get("ms", {}).items():
+            rows.append([run.label, coverage, stage, f"{time['p50']:.1f}", f"{time['p95']:.1f}"])
+    if rows:
+        result.append(Table("Coverage and time per stage", ["run", "coverage", "stage", "p50 ms", "p95 ms"], rows))
+    return result
+
+
+# ---- plots
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _opened(trajectory: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Stamps [n] and positions [n, 3] with a row of nan wherever tracking paused, so that no line is drawn there."""
+    pauses = np.flatnonzero(np.diff(trajectory.stamps) > _LOST_AFTER_S) + 1
+    stamps = np.insert(trajectory.stamps, pauses, np.nan)
+    return stamps, np.insert(trajectory.positions, pauses, np.nan, axis=0)
+
+
+def _lines(truth: Trajectory, runs: Sequence[_Run]) -> list[tuple[str, Trajectory, str]]:
+    rows = [("ground truth", truth, "black")]
+    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+        if run.estimate is not None:
+            rows.append((run.label, run.estimate, colour))
+    return rows
+
+
+def _plot_paths(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
+    figure = _figure(11, 5)
+    for axes, (i, j) in zip(figure.subplots(1, 2), [(0, 1), (0, 2)], strict=True):
+        for label, trajectory, colour in _lines(truth, runs):
+            positions = _opened(trajectory)[1]
+            axes.plot(positions[:, i], positions[:, j], color=colour, linewidth=1.2, label=label)
+        axes.set_xlabel(f"{'xyz'[i]} [m]")
+        axes.set_ylabel(f"{'xyz'[j]} [m]")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def _plot_over_time(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
+    figure = _figure(11, 6)
+    start = truth.stamps[0]
+    rows = figure.subplots(3, 1, sharex=True)
+    for k, axes in enumerate(rows):
+        for label, trajectory, colour in _lines(truth, runs):
+            stamps, positions = _opened(trajectory)
+            axes.plot(stamps - start, positions[:, k], color=colour, linewidth=1.2, label=label)
+        axes.set_ylabel(f"{'xyz'[k]} [m]")
+        axes.grid(alpha=0.3)
+    rows[0].legend(ncols=len(runs) + 1)
+    rows[-1].set_xlabel("time [s]")
+    return figure
+
+
+def _plot_errors(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
+    figure = _figure(11, 4)
+    axes = figure.subplots()
+    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+        if run.truth is None or run.estimate is None:
+            continue
+        errors = np.linalg.norm(run.estimate.positions - run.truth.positions, axis=1)
+        label = f"{run.label}: rmse {np.sqrt(np.mean(errors**2)):.4f} m"
+        axes.plot(run.truth.stamps - truth.stamps[0], np.maximum(errors, 1e-5), ".-", color=colour, ms=3, label=label)
+    axes.set_yscale("log")  # a run with masks and one without differ by more than ten
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("error [m]")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    return figure
+
+
+def _svg(figure: "Figure", caption: str) -> str:
+    import matplotlib
+
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "cohdc"}):  # the same run gives the same page
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return _embedded(buffer.getvalue(), "image/svg+xml", caption)
+
+
+# ---- pictures
+
+
+def _pictures(run: _Run) -> list[tuple[Path, str]]:
+    files = []
+    for before in sorted((run.folder / "pictures").glob("*_before.jpg")):
+        after = before.with_name(before.name.replace("_before", "_after"))
+        if after.is_file():  # a run without masks culls nothing
+            stamp = before.name.removesuffix("_before.jpg")
+            files += [(before, f"{run.label}, {stamp}, before"), (after, f"{run.label}, {stamp}, after")]
+    return files
+
+
+def _grid(files: Sequence[tuple[Path, str]]) -> str:
+    figures = []
+    for file, caption in files:
+        kind = "image/png" if file.suffix.lower() == ".png" else "image/jpeg"
+        try:
+            figures.append(_embedded(file.read_bytes(), kind, caption))
+        except OSError as error:
+            raise DataError(f"{file}: cannot be read: {error}") from error
+    return f'<div class="grid">{"".join(figures)}</div>'
+
+
+def _embedded(content: bytes, kind: str, caption: str) -> str:
+    data = base64.b64encode(content).decode("ascii")
+    text = html.escape(caption, quote=True)
+    return f'<figure><img alt="{text}" src="data:{kind};base64,{data}"><figcaption>{text}</figcaption></figure>\n'
