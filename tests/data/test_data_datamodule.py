@@ -1,0 +1,118 @@
+"""Batches: shapes, types, ranges, and the same ones for the same seed."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import coco_toys as toys
+import pytest
+import torch
+
+from cohdc_train.data.datamodule import CocoDataModule, Subset, TrainBatch
+from cohdc_train.data.transforms import Augmentation
+from cohdc_train.errors import DataError
+
+CANVAS = (40, 56)
+
+
+def module(root: Path, **more: Any) -> CocoDataModule:
+    options: dict[str, Any] = {"canvas": CANVAS, "batch_size": 3, "workers": 0, **more}
+    return CocoDataModule(root, **options)
+
+
+def test_classes_come_from_the_file(tmp_path: Path) -> None:
+    data = module(toys.folder(tmp_path))
+    assert (data.class_names, data.num_classes) == (["person", "car"], 2)
+    assert data.val_ground_truth()["categories"] == [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}]
+
+
+def test_a_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
+    data = module(toys.folder(tmp_path))
+    torch.manual_seed(1)
+    batches = list(data.train_dataloader())
+    assert [len(batch.targets) for batch in batches] == [3, 3]
+    for batch in batches:
+        assert batch.images.shape == (3, 3, *CANVAS)
+        assert batch.images.dtype == torch.uint8
+        for target in batch.targets:
+            n = len(target["labels"])
+            assert target["boxes"].shape == (n, 4)
+            assert target["boxes"].dtype == torch.float32
+            assert target["masks"].shape == (n, *CANVAS)
+            assert target["masks"].dtype == torch.uint8
+            assert target["ignore"].shape == (0, 4)
+            assert set(target["labels"].tolist()) <= {1, 2}
+    assert sorted(target["image_id"] for batch in batches for target in batch.targets) == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("photometric", [True, False])
+def test_after_the_transfer_images_are_unit_floats(tmp_path: Path, photometric: bool) -> None:
+    data = module(toys.folder(tmp_path), augment=Augmentation(photometric=photometric, scale_jitter=(0.5, 0.6)))
+    torch.manual_seed(0)
+    before = next(iter(data.train_dataloader()))
+    after = data.on_after_batch_transfer(before, 0)
+    assert isinstance(after, TrainBatch)
+    assert after.images.dtype == torch.float32
+    assert 0 <= float(after.images.min()) < float(after.images.max()) <= 1
+    for image, target in zip(after.images, after.targets, strict=True):
+        height, width = target["size"]
+        assert height < CANVAS[0]
+        assert (image[:, height:] == 0).all()
+        assert (image[:, :, width:] == 0).all()
+    same = torch.equal(after.images, before.images.float() / 255)
+    assert same is not photometric
+
+
+def test_objects_cropped_away_are_dropped_with_their_labels(tmp_path: Path) -> None:
+    data = module(toys.folder(tmp_path), augment=Augmentation(scale_jitter=(3.0, 3.0)))
+    torch.manual_seed(0)
+    targets = [target for _ in range(4) for batch in data.train_dataloader() for target in batch.targets]
+    assert {len(target["labels"]) for target in targets} >= {0, 1}
+    for target in targets:
+        assert (target["boxes"][:, 2:] > target["boxes"][:, :2]).all()
+        assert len(target["masks"]) == len(target["labels"]) == len(target["boxes"])
+
+
+def test_crowd_becomes_ignore_boxes(tmp_path: Path) -> None:
+    root = toys.folder(tmp_path)
+    path = root / "instances_train.json"
+    value = json.loads(path.read_text())
+    value["annotations"][0]["iscrowd"] = 1
+    toys.write(path, value)
+    data = module(root, augment=Augmentation(0.0, (1.0, 1.0)))
+    targets = {t["image_id"]: t for batch in data.train_dataloader() for t in batch.targets}
+    scale = CANVAS[0] / toys.HEIGHT
+    expected = torch.tensor([[3, 4, 19, 28]]) * scale
+    assert torch.allclose(targets[1]["ignore"], expected, atol=0.5)
+    assert targets[1]["labels"].tolist() == [2]
+    assert len(targets[2]["ignore"]) == 0
+
+
+def test_validation_images_are_untouched(tmp_path: Path) -> None:
+    data = module(toys.folder(tmp_path))
+    (batch,) = list(data.val_dataloader())
+    assert [image_id for _, image_id in batch] == [1, 2]
+    assert batch[0][0].shape == (3, toys.HEIGHT, toys.WIDTH)
+    assert tuple(batch[0][0][:, 10, 10].tolist()) == toys.COLOURS[10]
+    assert data.on_after_batch_transfer(batch, 0) is batch
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
+    root = toys.folder(tmp_path)
+    runs = []
+    for seed in (5, 5, 6):
+        torch.manual_seed(seed)
+        batches = list(module(root, workers=workers).train_dataloader())
+        runs.append(torch.cat([batch.images for batch in batches]))
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0], runs[2])
+
+
+def test_subsets_and_several_roots(tmp_path: Path) -> None:
+    roots = [toys.folder(tmp_path / "a"), toys.folder(tmp_path / "b")]
+    data = CocoDataModule(roots, ["person"], CANVAS, subset=Subset(train=2, val=1), workers=0)
+    assert len(data.train_dataloader().dataset) == 4  # type: ignore[arg-type]
+    assert len(data.val_dataloader().dataset) == 1  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="asked for"):
+        _ = CocoDataModule(roots[0], subset=Subset(val=3)).folder
