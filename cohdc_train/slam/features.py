@@ -72,7 +72,7 @@ class FeatureExtractor:
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found = self._orb.detect(gray, allowed)
         table = np.array([(*k.pt, k.octave, k.response) for k in found], dtype=np.float64).reshape(-1, 4)
-        chosen = self._spread(table)
+        chosen = spread(table, self._quota)
         kept, words = self._orb.compute(gray, [found[i] for i in chosen])
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
@@ -82,17 +82,21 @@ class FeatureExtractor:
         descriptors = np.ascontiguousarray(words).view(np.uint64)
         return Features(pixels, self.camera.undistort(pixels), octaves, descriptors, depths)
 
-    def _spread(self, table: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Rows of (x, y, octave, response) to keep: per level, the best of every cell first, then the second best."""
-        octave = table[:, 2].astype(np.int64)
-        size = _CELL * SCALE**octave
-        column, row = (table[:, 0] // size).astype(np.int64), (table[:, 1] // size).astype(np.int64)
-        cell = (octave * 10_000 + row) * 10_000 + column
-        order = np.lexsort((-table[:, 3], cell))
-        rank = np.empty(len(table), dtype=np.int64)
-        rank[order] = _running_index(cell[order])
-        order = np.lexsort((-table[:, 3], rank, octave))
-        return np.sort(order[_running_index(octave[order]) < self._quota[octave[order]]])
+
+def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Choose corners evenly: per pyramid level, the best of every grid cell first, then every cell's second best.
+
+    table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level. Returns rising rows.
+    """
+    octave = table[:, 2].astype(np.int64)
+    size = _CELL * SCALE**octave
+    column, row = (table[:, 0] // size).astype(np.int64), (table[:, 1] // size).astype(np.int64)
+    cell = (octave * 10_000 + row) * 10_000 + column
+    order = np.lexsort((-table[:, 3], cell))
+    rank = np.empty(len(table), dtype=np.int64)
+    rank[order] = _running_index(cell[order])
+    order = np.lexsort((-table[:, 3], rank, octave))
+    return np.sort(order[_running_index(octave[order]) < quota[octave[order]]])
 
 
 def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:

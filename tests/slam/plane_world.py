@@ -5,10 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.optimization import exp_se3
 from cohdc_train.trajectory import Trajectory, write_tum
-from numpy.typing import NDArray
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
 CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\ndepth_scale: 5000\n"
@@ -48,15 +49,15 @@ def room(seed: int = 0) -> list[Rectangle]:
 
 def passer_by(step: int, seed: int = 7) -> Rectangle:
     """A textured board before the camera that goes along with step: the worst kind of mover, full of corners."""
-    left = -1.3 + 0.035 * step
+    left = -1.0 + 0.03 * step
     rng = np.random.default_rng(seed)
-    board = texture(rng, 300, 240, patches=500)
-    return Rectangle(np.array([left, -0.7, 1.2]), np.array([0.9, 0, 0]), np.array([0, 1.4, 0]), board, moving=True)
+    board = texture(rng, 300, 140, patches=400)
+    return Rectangle(np.array([left, -0.7, 1.6]), np.array([0.65, 0, 0]), np.array([0, 1.4, 0]), board, moving=True)
 
 
 def camera_path(frames: int) -> NDArray[np.float64]:
     """[frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees."""
-    s = np.arange(frames) / 40.0 * 2 * np.pi
+    s = np.arange(frames) / 60.0 * 2 * np.pi
     xi = np.stack([0.25 * np.sin(s), 0.1 * np.sin(2 * s), 0.12 * (1 - np.cos(s))], axis=1)
     turn = np.stack([0.04 * np.sin(s), 0.08 * (1 - np.cos(s)), 0.05 * np.sin(2 * s)], axis=1)
     return exp_se3(np.concatenate([xi, turn], axis=1))

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from plane_world import CAMERA, camera_path, passer_by, render, room
+
+from cohdc_train.slam.culling import grow
 from cohdc_train.slam.features import Features
 from cohdc_train.slam.matching import Matches, Projected, match_projected, one_to_one
 from cohdc_train.slam.tracking import Pose, Tracker
 from cohdc_train.trajectory import Trajectory, score
-from numpy.typing import NDArray
-from plane_world import CAMERA, camera_path, passer_by, render, room
 
 BLACK = np.zeros((240, 320, 3), dtype=np.uint8)
 NOTHING = np.zeros((240, 320), dtype=np.float32)
@@ -23,7 +25,7 @@ def run(frames: int, mover: bool = False, masked: bool = False, seed: int = 0) -
     tracker, world, poses = Tracker(CAMERA, features=500, seed=seed), room(), []
     for index, T_wc in enumerate(camera_path(frames)):
         rgb, depth, moving = render([*world, passer_by(index)] if mover else world, T_wc)
-        poses.append(tracker.track(rgb, depth, index / 30, moving if masked else None))
+        poses.append(tracker.track(rgb, depth, index / 30, grow(moving, 7.0) if masked else None))
     return tracker, poses
 
 
@@ -93,9 +95,7 @@ def features_at(points: list[tuple[float, float]], words: list[int], octaves: li
 )
 def test_matching_by_projection(corner: tuple[float, float], octave: int, word: int, found: bool) -> None:
     features = features_at([corner], [word], [octave])
-    projected = Projected(
-        np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64)
-    )
+    projected = Projected(np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64))
     matches = match_projected(projected, features, radius=5.0)
     assert matches.points.tolist() == ([77] if found else [])
 

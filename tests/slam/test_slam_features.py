@@ -1,0 +1,109 @@
+"""Corners: the mask before the budget, the grid, the depth that is trusted; masks made of detections."""
+
+import numpy as np
+import pytest
+from plane_world import CAMERA, render, room
+
+from cohdc_train.errors import DataError
+from cohdc_train.segmenter import Detections
+from cohdc_train.slam.culling import Culling, dynamic_mask, grow
+from cohdc_train.slam.features import FeatureExtractor, Features, hamming, sample_depth, spread
+
+
+def test_the_mask_costs_no_budget() -> None:
+    rgb, depth, _ = render(room(), np.eye(4))
+    mask = np.zeros((240, 320), dtype=np.bool_)
+    mask[:, :150] = True
+    extract = FeatureExtractor(CAMERA, budget=300)
+    features, unmasked = extract(rgb, depth, mask), extract(rgb, depth)
+    columns, rows = np.rint(features.pixels).astype(int).T
+    assert not mask[rows, columns].any()
+    assert (unmasked.pixels[:, 0] < 149).sum() > 60, "without the mask corners lie there"
+    assert len(unmasked) >= 300
+    assert len(features) >= 300, "the budget is still filled"
+
+
+def test_corners_spread_over_cells_and_levels() -> None:
+    rng = np.random.default_rng(0)
+    strong = np.column_stack([rng.uniform(0, 31, size=(300, 2)), np.zeros(300), rng.uniform(100, 200, 300)])
+    weak = np.column_stack([[40.0 + 32 * k for k in range(8)], np.full(8, 40.0), np.zeros(8), np.full(8, 5.0)])
+    higher = np.array([[10.0, 10.0, 1.0, 7.0], [12.0, 10.0, 1.0, 9.0]])
+    table = np.concatenate([strong, weak, higher])
+    chosen = spread(table, quota=np.array([20, 1]))
+    assert set(range(300, 308)) <= set(chosen.tolist()), "one weak corner of every cell goes before a crowd's second"
+    best = np.argsort(-strong[:, 3])[:12]
+    assert set(chosen[chosen < 300].tolist()) == set(best.tolist())
+    assert chosen[chosen >= 308].tolist() == [309]
+
+
+def test_depth_is_refused_beside_edges_and_masks() -> None:
+    depth = np.full((240, 320), 2.0, dtype=np.float32)
+    depth[:, 100:] = 3.0
+    depth[50, 50] = 0.0
+    mask = np.zeros((240, 320), dtype=np.bool_)
+    mask[:, 200:] = True
+    pixels = np.array([[20.0, 20], [99, 20], [101, 20], [50, 50], [150, 20], [199, 20], [319, 239]])
+    got = sample_depth(depth, pixels, mask)
+    np.testing.assert_array_equal(np.isnan(got), [False, True, True, True, False, True, True])
+    np.testing.assert_allclose(got[[0, 4]], [2.0, 3.0])
+
+
+def test_hamming_counts_bits() -> None:
+    first = np.array([[0, 0, 0, 0], [1, 2, 4, 8]], dtype=np.uint64)
+    second = np.array([[2**64 - 1, 0, 0, 3], [1, 2, 4, 8]], dtype=np.uint64)
+    assert hamming(first, second).tolist() == [66, 0]
+
+
+def test_features_cannot_disagree_in_shape() -> None:
+    with pytest.raises(ValueError, match="disagree"):
+        Features(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(3, int), np.zeros((2, 4), np.uint64), np.zeros(2))
+
+
+def detections(*rows: tuple[tuple[float, float, float, float], int, float, float]) -> Detections:
+    """Full boxes: (box, label, score, quality)."""
+    return Detections(
+        boxes=np.array([row[0] for row in rows], dtype=np.float32).reshape(-1, 4),
+        labels=np.array([row[1] for row in rows], dtype=np.int64),
+        scores=np.array([row[2] for row in rows], dtype=np.float32),
+        quality=np.array([row[3] for row in rows], dtype=np.float32),
+        roi_masks=np.ones((len(rows), 28, 28), dtype=np.float32),
+        size=(240, 320),
+        class_names=("person", "chair"),
+    )
+
+
+def test_doubtful_contours_get_a_wider_band_and_are_never_dropped() -> None:
+    box = (100.0, 100.0, 150.0, 150.0)
+    culling = Culling(dilate=10)
+    sure = dynamic_mask(detections((box, 0, 0.9, 1.0)), frozenset([0]), culling)
+    unsure = dynamic_mask(detections((box, 0, 0.9, 0.0)), frozenset([0]), culling)
+    assert sure[125, 90]
+    assert not sure[125, 88]
+    assert unsure[125, 80]
+    assert not unsure[125, 78]
+
+
+def test_only_dynamic_classes_above_the_score_count() -> None:
+    left, middle, right = (10.0, 10.0, 40.0, 40.0), (100.0, 10.0, 140.0, 40.0), (200.0, 10.0, 240.0, 40.0)
+    found = detections((left, 0, 0.9, 1.0), (middle, 1, 0.9, 1.0), (right, 0, 0.3, 1.0))
+    mask = dynamic_mask(found, frozenset([0]), Culling(dilate=0))
+    assert mask.sum() == 30 * 30
+    assert mask[20, 20]
+    assert not dynamic_mask(detections(), frozenset([0]), Culling()).any()
+
+
+def test_grow_is_a_disc() -> None:
+    mask = np.zeros((41, 41), dtype=np.bool_)
+    mask[20, 20] = True
+    v, u = np.mgrid[:41, :41]
+    exact = np.hypot(u - 20, v - 20)
+    grown = grow(mask, 8.0)
+    assert grown[exact < 7.5].all()
+    assert not grown[exact > 8.5].any()
+    assert grow(mask, 0.0).sum() == 1
+
+
+@pytest.mark.parametrize("bad", [{"dilate": -1}, {"score": 1.5}])
+def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
+    with pytest.raises(DataError, match=next(iter(bad))):
+        Culling(**bad)  # type: ignore[arg-type]

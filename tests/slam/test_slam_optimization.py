@@ -1,0 +1,188 @@
+"""Known answers for the geometry: exponential map, Jacobians, pose, RANSAC, bundle adjustment."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from plane_world import CAMERA
+from scipy.linalg import expm
+from scipy.optimize import least_squares
+
+from cohdc_train.slam.bundle_adjustment import Problem, adjust, local_points, measurement_chi2
+from cohdc_train.slam.optimization import (
+    CHI2_DEPTH,
+    Observations,
+    Weighing,
+    chi_square,
+    exp_se3,
+    optimize_pose,
+    pose_jacobian,
+    residual_jacobian,
+    residuals,
+    skew,
+    to_local,
+)
+from cohdc_train.slam.ransac import ransac_pose, rigid_transforms
+
+Array = NDArray[np.float64]
+WEIGHING = Weighing(CAMERA)
+
+
+def cloud(rng: np.random.Generator, count: int) -> Array:
+    """Points that a camera near the origin sees, m."""
+    return rng.uniform([-1.0, -0.7, 1.5], [1.0, 0.7, 4.0], size=(count, 3))
+
+
+def observe(T_cw: Array, points: Array, rng: np.random.Generator, noise: float = 0.0) -> Observations:
+    """What the camera measures, a fifth of it without depth; noise in px, and as disparity in depth."""
+    local = to_local(T_cw, points)
+    pixels = CAMERA.project(local) + rng.normal(size=(len(points), 2)) * noise
+    depths = WEIGHING.bf / (WEIGHING.bf / local[:, 2] + rng.normal(size=len(points)) * noise)
+    depths[rng.random(len(points)) < 0.2] = np.nan
+    return Observations(pixels, depths, rng.choice([1.0, 1.2, 1.44], size=len(points)))
+
+
+@given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
+def test_exponential_map_is_the_matrix_exponential(values: list[float]) -> None:
+    xi = np.array(values)
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = skew(xi[3:]), xi[:3]
+    np.testing.assert_allclose(exp_se3(xi), expm(generator), atol=1e-8)
+
+
+@given(st.integers(0, 10_000))
+def test_jacobians_equal_differences(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_cw, points = exp_se3(rng.normal(size=6) * 0.1), cloud(rng, 8)
+    seen = observe(T_cw, points, rng, noise=2.0)
+    local = to_local(T_cw, points)
+    derivative = residual_jacobian(local, seen, WEIGHING)
+    by_pose, by_point = pose_jacobian(local, derivative), derivative @ T_cw[:3, :3]
+
+    def error(T: Array, shift: Array) -> Array:
+        return residuals(to_local(T, points + shift), seen, WEIGHING)
+
+    for axis in range(6):
+        step = np.eye(6)[axis] * 1e-6
+        change = error(exp_se3(step) @ T_cw, np.zeros(3)) - error(exp_se3(-step) @ T_cw, np.zeros(3))
+        np.testing.assert_allclose(by_pose[:, :, axis], change / 2e-6, rtol=1e-4, atol=1e-3)
+    for axis in range(3):
+        step = np.eye(3)[axis] * 1e-6
+        np.testing.assert_allclose(
+            by_point[:, :, axis], (error(T_cw, step) - error(T_cw, -step)) / 2e-6, rtol=1e-4, atol=1e-3
+        )
+
+
+def test_pose_is_found_and_outliers_are_told() -> None:
+    rng = np.random.default_rng(1)
+    T_cw, points = exp_se3(np.array([0.1, -0.05, 0.2, 0.05, -0.1, 0.02])), cloud(rng, 200)
+    seen = observe(T_cw, points, rng, noise=0.1)
+    seen.pixels[:30] += rng.uniform(15, 40, size=(30, 2))
+    found, inlier = optimize_pose(np.eye(4), points, seen, WEIGHING)
+    assert np.linalg.norm(found[:3, 3] - T_cw[:3, 3]) < 1e-3
+    assert not inlier[:30].any()
+    assert inlier[30:].all()
+
+
+def test_a_point_behind_the_camera_is_never_an_inlier() -> None:
+    points = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
+    seen = Observations(np.full((2, 2), [CAMERA.cx, CAMERA.cy]), np.full(2, np.nan), np.ones(2))
+    np.testing.assert_array_equal(chi_square(np.eye(4), points, seen, WEIGHING) < CHI2_DEPTH, [False, True])
+
+
+@given(st.integers(0, 10_000))
+def test_rigid_transforms_are_recovered(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, source = exp_se3(rng.normal(size=(5, 6))), rng.normal(size=(5, 4, 3))
+    target = source @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+    np.testing.assert_allclose(rigid_transforms(source, target), T, atol=1e-6)
+
+
+def test_ransac_survives_sixty_percent_outliers() -> None:
+    rng = np.random.default_rng(2)
+    T_cw, points = exp_se3(np.array([0.3, -0.2, 0.1, 0.1, -0.2, 0.3])), cloud(rng, 150)
+    seen = observe(T_cw, points, rng, noise=0.2)
+    seen.pixels[:90] = rng.uniform([0, 0], [320, 240], size=(90, 2))
+    found = ransac_pose(points, seen, CAMERA, np.random.default_rng(0), hypotheses=256)
+    assert found is not None
+    assert found[1][90:].mean() > 0.9
+    assert found[1][:90].mean() < 0.1
+    refined, _ = optimize_pose(found[0], points[found[1]], seen.take(found[1]), WEIGHING)
+    assert np.linalg.norm(refined[:3, 3] - T_cw[:3, 3]) < 0.01
+
+
+def test_ransac_without_depth_falls_back_on_the_guess() -> None:
+    rng = np.random.default_rng(3)
+    points = cloud(rng, 20)
+    seen = Observations(CAMERA.project(points), np.full(20, np.nan), np.ones(20))
+    assert ransac_pose(points, seen, CAMERA, rng) is None
+    found = ransac_pose(points, seen, CAMERA, rng, guess=np.eye(4))
+    assert found is not None
+    assert found[1].all()
+
+
+def small_problem(seed: int, outliers: int = 0) -> tuple[Array, Array, Array, Array, Problem]:
+    """Five cameras, two of them fixed, 40 points. Returns true poses and points, disturbed ones, and the problem."""
+    rng = np.random.default_rng(seed)
+    poses, points = exp_se3(rng.normal(size=(5, 6)) * 0.08), cloud(rng, 40)
+    rows = [np.sort(rng.permutation(40)[:30]) for _ in poses]
+    seen = [observe(T, points[r], rng, noise=0.3) for T, r in zip(poses, rows, strict=True)]
+    everything = Observations(
+        np.concatenate([s.pixels for s in seen]),
+        np.concatenate([s.depths for s in seen]),
+        np.concatenate([s.sigmas for s in seen]),
+    )
+    everything.pixels[:outliers] += 60.0
+    free = np.array([False, False, True, True, True])
+    problem = Problem(np.repeat(np.arange(5), 30), np.concatenate(rows), everything, free)
+    start = poses.copy()
+    start[free] = exp_se3(rng.normal(size=(3, 6)) * 0.02) @ poses[free]
+    return poses, points, start, points + rng.normal(size=points.shape) * 0.03, problem
+
+
+def test_schur_bundle_adjustment_equals_a_general_solver() -> None:
+    _, _, poses, points, problem = small_problem(4)
+
+    def error(x: Array) -> Array:
+        moved = poses.copy()
+        moved[problem.free] = exp_se3(x[:18].reshape(3, 6)) @ poses[problem.free]
+        local = local_points(moved, x[18:].reshape(-1, 3), problem)
+        return residuals(local, problem.seen, WEIGHING).reshape(-1)
+
+    expected = least_squares(error, np.r_[np.zeros(18), points.reshape(-1)], method="lm", xtol=1e-14, ftol=1e-14)
+    got_poses, got_points = poses, points
+    for _ in range(4):  # it stops when a step gains less than a thousandth
+        got_poses, got_points = adjust(got_poses, got_points, problem, WEIGHING, steps=20, robust=False)
+    cost = measurement_chi2(got_poses, got_points, problem, WEIGHING).sum()
+    assert cost == pytest.approx(2 * expected.cost, rel=1e-6)
+    wanted = exp_se3(expected.x[:18].reshape(3, 6)) @ poses[problem.free]
+    np.testing.assert_allclose(got_poses[problem.free], wanted, atol=1e-5)
+    np.testing.assert_allclose(got_points, expected.x[18:].reshape(-1, 3), atol=1e-3)
+
+
+def test_bundle_adjustment_tells_outliers_and_leaves_fixed_poses() -> None:
+    true_poses, _, poses, points, problem = small_problem(5, outliers=6)
+    new_poses, new_points = adjust(poses, points, problem, WEIGHING, steps=20)
+    good = measurement_chi2(new_poses, new_points, problem, WEIGHING) <= problem.seen.limits
+    assert not good[:6].any()
+    assert good[6:].all()
+    new_poses, _ = adjust(new_poses, new_points, problem.take(good), WEIGHING, steps=20, robust=False)
+    np.testing.assert_array_equal(new_poses[:2], poses[:2])
+    before = np.linalg.norm(poses[2:, :3, 3] - true_poses[2:, :3, 3], axis=1)
+    after = np.linalg.norm(new_poses[2:, :3, 3] - true_poses[2:, :3, 3], axis=1)
+    assert after.max() < 0.006 < 0.02 < before.min()
+
+
+def test_the_cost_never_rises_from_a_bad_start() -> None:
+    _, _, poses, points, problem = small_problem(6)
+    points = points + np.random.default_rng(0).normal(size=points.shape) * 0.4
+    before = measurement_chi2(poses, points, problem, WEIGHING).sum()
+    result = adjust(poses, points, problem, WEIGHING, steps=3, robust=False)
+    assert measurement_chi2(*result, problem, WEIGHING).sum() < before
+
+
+def test_a_problem_refuses_unsorted_cameras() -> None:
+    seen = Observations(np.zeros((2, 2)), np.zeros(2), np.ones(2))
+    with pytest.raises(ValueError, match="sorted by camera"):
+        Problem(np.array([1, 0]), np.array([0, 0]), seen, np.array([True, True]))

@@ -1,0 +1,161 @@
+"""The command: its files, its errors, and that torch stays away."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from plane_world import CAMERA_YAML, write_sequence
+
+from cohdc_train.cli import main
+from cohdc_train.errors import DataError
+from cohdc_train.segmenter import Detections
+from cohdc_train.slam.culling import Culling, ModelMasks
+from cohdc_train.slam.run import slam
+from cohdc_train.slam.tum import Frame
+from cohdc_train.trajectory import read_tum
+
+SIX = {"rmse", "mean", "median", "std", "min", "max"}
+FRAMES = 36
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A TUM folder with a passer-by."""
+    return write_sequence(tmp_path_factory.mktemp("walk"), FRAMES, with_passer_by=True)
+
+
+@pytest.fixture(scope="module")
+def masked(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder a run with masks leaves, run by the command line."""
+    out = tmp_path_factory.mktemp("out") / "run"
+    arguments = ["slam", "--sequence", str(sequence), "--out", str(out), "--masks", str(sequence / "masks")]
+    assert main([*arguments, "--features", "500", "--seed", "1", "--culling.dilate", "7"]) == 0
+    return out
+
+
+def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
+    metrics = json.loads((masked / "metrics.json").read_text())
+    assert metrics["frames"] == FRAMES
+    assert metrics["coverage"] == 1.0
+    assert metrics["seed"] == 1
+    assert metrics["without_depth"] == 0
+    assert set(metrics["ms"]) == {"segment", "track", "map"}
+    assert 0 < metrics["ms"]["track"]["p50"] <= metrics["ms"]["track"]["p95"]
+    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
+        assert set(metrics[key]) == SIX
+    assert metrics["ate_m"]["rmse"] < 0.006
+
+
+def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequence: Path) -> None:
+    names = {path.name for path in masked.iterdir()}
+    assert names == {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", "pictures"}
+    assert [path.name for path in masked.parent.iterdir()] == ["run"], "no temporary folder is left"
+    trajectory, truth = read_tum(masked / "trajectory.txt"), read_tum(sequence / "groundtruth.txt")
+    np.testing.assert_array_equal(trajectory.stamps, truth.stamps)
+    with (masked / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == FRAMES
+    assert rows[0]["stamp"] == "100.000000"
+    assert rows[0]["keyframe"] == "1"
+    assert all(0.2 < float(row["culled_share"]) < 0.6 for row in rows)
+    config = yaml.safe_load((masked / "config.yaml").read_text())
+    assert config["culling"] == {"dynamic_classes": None, "score": 0.5, "dilate": 7}
+    assert config["camera"]["fx"] == 260
+    assert config["seed"] == 1
+
+
+def test_pictures_show_what_was_culled(masked: Path) -> None:
+    names = sorted(path.name for path in (masked / "pictures").iterdir())
+    assert len(names) == 12
+    before = cv2.imread(str(masked / "pictures" / "100.000000_before.jpg"))
+    after = cv2.imread(str(masked / "pictures" / "100.000000_after.jpg"))
+    assert before.shape == after.shape == (240, 320, 3)
+    assert (before != after).any()
+
+
+def test_without_masks_the_passer_by_spoils_it_and_a_rerun_replaces_the_files(
+    sequence: Path, masked: Path, tmp_path: Path
+) -> None:
+    good = json.loads((masked / "metrics.json").read_text())["ate_m"]["rmse"]
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "old.jpg").touch()
+    (tmp_path / "mine.txt").touch()
+    metrics = slam(sequence=sequence, out=tmp_path, features=500)
+    assert metrics["ate_m"]["rmse"] > 5 * good
+    assert metrics["ms"]["segment"]["p95"] == 0
+    assert (tmp_path / "mine.txt").exists()
+    pictures = [path.name for path in (tmp_path / "pictures").iterdir()]
+    assert len(pictures) == 6
+    assert "old.jpg" not in pictures
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda root: (root / "rgb.txt").unlink(), "rgb.txt: cannot be read"),
+        (lambda root: (root / "depth.txt").write_text("1.0\n"), "depth.txt:1: expected"),
+        (lambda root: (root / "camera.yaml").unlink(), "cannot tell the camera"),
+        (lambda root: (root / "camera.yaml").write_text("fx: 1\n fy: 2\n"), "camera.yaml:2: broken yaml"),
+        (lambda root: (root / "camera.yaml").write_text(CAMERA_YAML.replace("320", "640")), "the camera says 640x240"),
+        (lambda root: next((root / "masks").iterdir()).unlink(), "masks/100.000000.png: cannot be read"),
+    ],
+    ids=["no list", "broken list", "no camera", "broken camera", "wrong size", "mask missing"],
+)
+def test_a_users_error_is_one_line_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: object, said: str
+) -> None:
+    root = write_sequence(tmp_path / "room", 1)
+    assert callable(change)
+    change(root)
+    arguments = ["slam", "--sequence", str(root), "--out", str(tmp_path / "out"), "--masks", str(root / "masks")]
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["room"]
+
+
+def test_model_and_masks_together_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not both"):
+        slam(sequence=tmp_path, out=tmp_path / "o", model=tmp_path / "m.onnx", masks=tmp_path)
+
+
+def test_out_must_not_be_a_file(tmp_path: Path) -> None:
+    (tmp_path / "out").touch()
+    with pytest.raises(DataError, match="is a file"):
+        slam(sequence=tmp_path, out=tmp_path / "out")
+
+
+class TwoClasses:
+    """Stands for a segmenter: one person in the left half of whatever it sees."""
+
+    class_names = ("person", "chair")
+
+    def __call__(self, rgb: np.ndarray) -> Detections:
+        height, width = rgb.shape[:2]
+        box = np.array([[0, 0, width / 2, height]], dtype=np.float32)
+        one = np.ones(1, dtype=np.float32)
+        mask = np.ones((1, 28, 28), dtype=np.float32)
+        return Detections(box, np.zeros(1, dtype=np.int64), one, one, mask, (height, width), self.class_names)
+
+
+def test_a_model_masks_the_classes_that_are_asked_for(tmp_path: Path) -> None:
+    frame = Frame(0.0, "0", tmp_path, tmp_path)
+    rgb = np.zeros((240, 320, 3), dtype=np.uint8)
+    model = TwoClasses()
+    assert ModelMasks(model, Culling(dilate=0))(frame, rgb).mean() == 0.5  # type: ignore[arg-type]
+    chairs = ModelMasks(model, Culling(dynamic_classes=["chair"]))  # type: ignore[arg-type]
+    assert not chairs(frame, rgb).any()
+    with pytest.raises(DataError, match="'dog' is not one of the model's: person, chair"):
+        ModelMasks(model, Culling(dynamic_classes=["dog"]))  # type: ignore[arg-type]
+
+
+def test_torch_is_never_imported() -> None:
+    code = "import sys, cohdc_train.slam.run, cohdc_train.segmenter; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
