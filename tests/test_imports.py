@@ -1,0 +1,170 @@
+"""Who may import whom: the table of rooms, read from the sources' imports."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "cohdc_train"
+NAME = PACKAGE.name
+
+# Room -> the rooms it may import. A room is a file or a folder of the package.
+ALLOWED: dict[str, set[str]] = {
+    "__init__": set(),
+    "__main__": {"cli"},
+    "errors": set(),
+    "signature": set(),
+    "masks": {"errors"},
+    "presets": {"errors"},
+    "env": {"errors"},
+    "contour": {"errors"},
+    "trajectory": {"errors"},
+    "data": {"errors"},
+    "synth": {"errors"},
+    "models": set(),
+    "onnx_operators": {"models"},
+    "train": {"data", "models", "contour", "masks", "presets", "errors"},
+    "export": {"train", "models", "signature", "masks", "onnx_operators", "errors"},
+    "bench": {"train", "data", "models", "export", "segmenter", "masks", "errors"},
+    "segmenter": {"signature", "masks", "errors"},
+    "predict": {"segmenter", "contour", "masks", "errors"},
+    "slam": {"segmenter", "signature", "contour", "trajectory", "masks", "presets", "errors"},
+    "report": {"trajectory", "contour", "errors"},
+    "cli": {"errors"},  # and any verb's module, by name inside the call
+}
+ALLOWED["demo"] = set(ALLOWED) - {"cli", "__main__"}
+# The program's name and version, which any room may state.
+FREE = {"__init__"}
+WITHOUT_TORCH = ("slam", "segmenter", "predict", "trajectory", "contour", "report", "env", "masks", "cli")
+TORCH = {"torch", "torchvision", "lightning", "pytorch_lightning", "kornia", "onnxscript", "torchmetrics"}
+
+
+def sources(package: Path) -> Iterator[tuple[str, str, Path]]:
+    """(room, dotted module inside the package, file) of every source."""
+    for file in sorted(package.rglob("*.py")):
+        parts = file.relative_to(package).with_suffix("").parts
+        yield parts[0], ".".join(parts), file
+
+
+def imported(file: Path, package: Path) -> Iterator[tuple[int, str]]:
+    """(line, absolute dotted name) of every import in a file, wherever in it; relative ones are resolved.
+
+    `from a import b` gives a.b, since b may be a module.
+    """
+    here = (package.name, *file.relative_to(package).with_suffix("").parts)
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(here[: len(here) - node.level]) if node.level else ""
+            base = ".".join(part for part in (base, node.module or "") if part)
+            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+
+
+def edges(package: Path) -> dict[str, set[tuple[str, str]]]:
+    """Room -> {(room or foreign package it imports, place)}; foreign ones are written with a leading `/`."""
+    rooms = {room for room, _, _ in sources(package)}
+    graph: dict[str, set[tuple[str, str]]] = {room: set() for room in rooms}
+    for room, _, file in sources(package):
+        for line, name in imported(file, package):
+            first, *rest = name.split(".")
+            place = f"{file.relative_to(package)}:{line}"
+            if first != package.name:
+                graph[room].add((f"/{first}", place))
+                continue
+            target = rest[0] if rest and rest[0] in rooms else "__init__"
+            if target != room:
+                graph[room].add((target, place))
+    return graph
+
+
+def faults(package: Path) -> list[str]:
+    """Every import that the table forbids, and every way on which a torch-free room reaches torch."""
+    graph = edges(package)
+    found = [f"{room} is not in the table of rooms" for room in graph if room not in ALLOWED]
+    for room, targets in graph.items():
+        for target, place in sorted(targets):
+            ours = not target.startswith("/")
+            if ours and room in ALLOWED and target not in ALLOWED[room] | FREE:
+                found.append(f"{place}: {room} may not import {target}")
+    for room in WITHOUT_TORCH:
+        if room in graph:
+            found += [f"{room} reaches {way}" for way in ways_to_torch(graph, room)]
+    return found
+
+
+def ways_to_torch(graph: dict[str, set[tuple[str, str]]], start: str) -> list[str]:
+    """Chains of rooms from `start` to an import of torch or of what needs it."""
+    ways, seen, queue = [], {start}, [(start, start)]
+    while queue:
+        room, way = queue.pop(0)
+        for target, place in sorted(graph.get(room, ())):
+            if target.startswith("/") and target[1:] in TORCH:
+                ways.append(f"{target[1:]} by {way} ({place})")
+            elif not target.startswith("/") and target not in seen:
+                seen.add(target)
+                queue.append((target, f"{way} -> {target}"))
+    return ways
+
+
+def test_rooms_import_only_what_the_table_allows() -> None:
+    assert faults(PACKAGE) == []
+
+
+def test_table_holds_no_cycle() -> None:
+    """The table itself goes one way: rooms can be put in an order in which each imports earlier ones only."""
+    placed: set[str] = set()
+    while free := {room for room in ALLOWED if room not in placed and ALLOWED[room] <= placed}:
+        placed |= free
+    assert placed == set(ALLOWED)
+
+
+def plant(folder: Path, files: dict[str, str]) -> Path:
+    package = folder / NAME
+    for name, text in files.items():
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / name).write_text(text)
+    return package
+
+
+HOUSE = {
+    "__init__.py": "",
+    "errors.py": "",
+    "slam/__init__.py": "",
+    "slam/run.py": "import numpy\nfrom cohdc_train.errors import CohdcError\n",
+    "train/module.py": "import torch\nfrom cohdc_train import __version__\n",
+    "segmenter.py": "import onnxruntime\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "fault"),
+    [
+        ("slam/run.py", "import numpy\nimport torch\n", "slam reaches torch by slam (slam/run.py:2)"),
+        ("slam/run.py", "def f():\n    from torch.nn import Module\n", "slam reaches torch by slam (slam/run.py:2)"),
+        ("slam/run.py", "import kornia.geometry as g\n", "slam reaches kornia by slam (slam/run.py:1)"),
+        ("slam/run.py", "from cohdc_train.train.module import x\n", "slam/run.py:1: slam may not import train"),
+        ("slam/run.py", "from cohdc_train import train\n", "slam/run.py:1: slam may not import train"),
+        ("slam/run.py", "from ..train import module\n", "slam/run.py:1: slam may not import train"),
+        ("slam/run.py", "import cohdc_train.train.module\n", "slam reaches torch by slam -> train (train/module.py:1)"),
+        ("slam/run.py", "from .. import train\n", "slam reaches torch by slam -> train (train/module.py:1)"),
+        ("masks.py", "import torch\n", "masks reaches torch by masks (masks.py:1)"),
+        ("utils.py", "", "utils is not in the table of rooms"),
+    ],
+)
+def test_planted_import_is_found(tmp_path: Path, file: str, text: str, fault: str) -> None:
+    assert fault in faults(plant(tmp_path, {**HOUSE, file: text}))
+
+
+def test_torch_is_found_through_another_room(tmp_path: Path) -> None:
+    planted = {
+        "slam/run.py": "from cohdc_train import segmenter\n",
+        "segmenter.py": "from cohdc_train.masks import m\n",
+    }
+    found = faults(plant(tmp_path, {**HOUSE, **planted, "masks.py": "import torchvision\n"}))
+    assert "slam reaches torchvision by slam -> segmenter -> masks (masks.py:1)" in found
+
+
+def test_clean_house_has_no_fault(tmp_path: Path) -> None:
+    assert faults(plant(tmp_path, HOUSE)) == []
