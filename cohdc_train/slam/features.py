@@ -1,5 +1,6 @@
 """ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that can be trusted."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,9 @@ from cohdc_train.slam.camera import Camera
 SCALE = 1.2  # between two levels of the image pyramid
 LEVELS = 8
 _CELL = 32  # px at the level of the corner
-_POOL = 2.5  # corners detected per corner kept: what the grid chooses from
+_POOL = 2.0  # corners detected per corner kept: what the grid chooses from
+_ENOUGH = 1.6  # the same, below which the second threshold is tried
+_THRESHOLDS = (20, 7)  # of FAST, grey levels
 _EDGE_PATCH = 2  # px: a depth edge this near to a corner spoils its depth
 _EDGE_RELATIVE = 0.04  # of the depth: a larger step inside the patch is an edge
 _MASK_BAND = 2  # px beside the mask where depth is refused
@@ -52,15 +55,7 @@ class FeatureExtractor:
     def __init__(self, camera: Camera, budget: int = 1000) -> None:
         self.camera = camera
         self.budget = budget
-        pool = int(budget * _POOL)
-        self._orb = cv2.ORB.create(
-            nfeatures=pool,
-            scaleFactor=SCALE,
-            nlevels=LEVELS,
-            edgeThreshold=19,
-            scoreType=cv2.ORB_FAST_SCORE,
-            fastThreshold=7,
-        )
+        self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]
         shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
         self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
 
@@ -70,10 +65,10 @@ class FeatureExtractor:
         """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there."""
         gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
-        found = self._orb.detect(gray, allowed)
+        found = self._detect(gray, allowed)
         table = np.array([(*k.pt, k.octave, k.response) for k in found], dtype=np.float64).reshape(-1, 4)
         chosen = spread(table, self._quota)
-        kept, words = self._orb.compute(gray, [found[i] for i in chosen])
+        kept, words = self._detectors[0].compute(gray, [found[i] for i in chosen])
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels = np.array([k.pt for k in kept], dtype=np.float64).reshape(-1, 2)
@@ -81,6 +76,22 @@ class FeatureExtractor:
         depths = sample_depth(depth, pixels, mask)
         descriptors = np.ascontiguousarray(words).view(np.uint64)
         return Features(pixels, self.camera.undistort(pixels), octaves, descriptors, depths)
+
+    def _detect(self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None) -> Sequence[cv2.KeyPoint]:
+        """Strong corners, which are quick to find; where they do not suffice, weak ones too."""
+        found = self._detectors[0].detect(gray, allowed)
+        return found if len(found) >= _ENOUGH * self.budget else self._detectors[1].detect(gray, allowed)
+
+
+def _orb(count: int, threshold: int) -> cv2.ORB:
+    return cv2.ORB.create(
+        nfeatures=count,
+        scaleFactor=SCALE,
+        nlevels=LEVELS,
+        edgeThreshold=19,
+        scoreType=cv2.ORB_FAST_SCORE,
+        fastThreshold=threshold,
+    )
 
 
 def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.int64]:

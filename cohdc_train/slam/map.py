@@ -97,13 +97,16 @@ class Map:
         alias[old] = new
         alias[-1] = -1
         for keyframe in keyframes:
-            changed = np.flatnonzero(alias[keyframe.point_ids] != keyframe.point_ids)
-            ids = alias[keyframe.point_ids[changed]]
+            ids = alias[keyframe.point_ids]
+            changed = np.flatnonzero(ids != keyframe.point_ids)
+            if len(changed) == 0:
+                continue
             self.forget(keyframe, changed)
-            fresh = ~np.isin(ids, keyframe.point_ids)
-            _, first = np.unique(ids, return_index=True)
-            fresh &= np.isin(np.arange(len(ids)), first)
-            self.observe(keyframe, Matches(ids[fresh], changed[fresh]))
+            taken = np.zeros(self.size + 1, dtype=np.bool_)
+            taken[keyframe.point_ids] = True
+            moved, first = np.unique(ids[changed], return_index=True)
+            fresh = ~taken[moved]
+            self.observe(keyframe, Matches(moved[fresh], changed[first[fresh]]))
 
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first."""

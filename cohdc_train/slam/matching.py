@@ -9,6 +9,8 @@ from scipy.spatial import cKDTree
 
 from cohdc_train.slam.features import Features, hamming
 
+_WIDEST = 2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -41,17 +43,17 @@ class Projected:
 def match_projected(
     projected: Projected, features: Features, radius: float, max_distance: int = 90, ratio: float = 0.9
 ) -> Matches:
-    """Nearest descriptor among the corners within `radius` px (times the corner's scale) and one level of each point.
+    """Nearest descriptor among the corners within `radius` px (times the corner's scale, up to 2) and one level of each point.
 
     max_distance: bits; ratio: the best must beat this share of the second best. One corner takes one point.
     """
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    widest = radius * float(features.sigmas.max())
+    reach = radius * np.minimum(features.sigmas, _WIDEST)
     tree = cKDTree(projected.pixels)
-    pairs = tree.sparse_distance_matrix(cKDTree(features.points), widest, output_type="ndarray")
+    pairs = tree.sparse_distance_matrix(cKDTree(features.points), float(reach.max()), output_type="ndarray")
     i, j = pairs["i"].astype(np.int64), pairs["j"].astype(np.int64)
-    near = pairs["v"] <= radius * features.sigmas[j]
+    near = pairs["v"] <= reach[j]
     near &= np.abs(features.octaves[j] - projected.levels[i]) <= 1
     i, j = i[near], j[near]
     bits = hamming(projected.descriptors[i], features.descriptors[j])

@@ -56,12 +56,11 @@ class Weighing:
 def exp_se3(xi: Array) -> Array:
     """xi: [..., 6] (translation part, rotation vector rad). Returns [..., 4, 4]."""
     rho, phi = xi[..., :3], xi[..., 3:]
-    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
-    small = angle < 1e-7
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0 - angle**2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    c = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    square_angle = np.einsum("...i,...i->...", phi, phi)[..., None, None]
+    angle = np.sqrt(square_angle)
+    a = np.sinc(angle / np.pi)  # sin(angle) / angle
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 - cos(angle)) / angle^2
+    c = np.where(angle < 1e-3, 1 / 6, (1 - a) / np.maximum(square_angle, 1e-12))
     cross = skew(phi)
     square = cross @ cross
     result = np.zeros((*xi.shape[:-1], 4, 4))
@@ -136,7 +135,7 @@ def huber_weights(chi2: Array, limits: Array) -> Array:
 
 
 def optimize_pose(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, rounds: int = 3
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, rounds: int = 2
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Gauss-Newton on the six parameters of a pose, Huber-weighted; outliers are dropped and may return every round.
 
