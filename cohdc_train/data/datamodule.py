@@ -124,7 +124,7 @@ class CocoDataModule(pl.LightningDataModule):
 
     def __init__(
         self,
-        root: Path | list[Path] | None = None,
+        root: list[Path] | Path | None = None,
         classes: list[str] | None = None,
         canvas: tuple[int, int] = (800, 1024),
         batch_size: int = 2,

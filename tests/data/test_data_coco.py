@@ -2,6 +2,8 @@
 
 import copy
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -238,3 +240,8 @@ def test_the_real_sets_hold_what_their_readme_says() -> None:
     vehicles = read_folder([data / "coad_vehicles"])
     assert vehicles.class_names == ("vehicle", "person", "motorcycle")
     assert len(vehicles.val.images) == 88
+
+
+def test_counting_needs_no_torch() -> None:
+    code = "import sys, cohdc_train.data.doctor; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -162,6 +162,12 @@ def test_a_wrong_key_or_type_is_a_usage_error(toy: Path, wrong: str) -> None:
     assert stop.value.code == 2
 
 
+def test_several_roots_are_a_list(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        fit([f"--data.root=[{toy},{toy}]", "--print_config"])
+    assert yaml.safe_load(capsys.readouterr().out)["data"]["root"] == [str(toy), str(toy)]
+
+
 def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         fit(["--print_config"])
