@@ -92,10 +92,12 @@ def face(rng: np.random.Generator, tone: Floats, hair: Floats) -> Texture:
 def hair(rng: np.random.Generator, rgb: Floats) -> Texture:
     """[128, 128, 3] strands running down."""
     strands = cv2.resize(rng.normal(0, 16, (4, SIDE)).astype(np.float32), (SIDE, SIDE))
-    return np.clip(flat(SIDE, SIDE, rgb) + strands[..., None], 0, 255).astype(np.uint8)
+    image: Texture = np.clip(flat(SIDE, SIDE, rgb) + strands[..., None], 0, 255).astype(np.uint8)
+    return image
 
 
 def hair_colour(rng: np.random.Generator) -> Floats:
     """[3] RGB: black, brown, blond, red or grey."""
     known = np.array([[22, 18, 16], [58, 38, 26], [96, 64, 40], [178, 142, 88], [120, 58, 30], [150, 148, 145]])
-    return np.clip(known[int(rng.integers(len(known)))] + rng.normal(0, 8, 3), 5, 230).astype(np.float32)
+    rgb: Floats = np.clip(known[int(rng.integers(len(known)))] + rng.normal(0, 8, 3), 5, 230).astype(np.float32)
+    return rgb

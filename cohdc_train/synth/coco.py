@@ -15,7 +15,7 @@ from cohdc_train.synth.annotation import annotate
 from cohdc_train.synth.folder import new_folder
 from cohdc_train.synth.mesh import Floats, join
 from cohdc_train.synth.renderer import Atlas, Camera, render
-from cohdc_train.synth.scene import Lighting, Room, furnished_room
+from cohdc_train.synth.scene import Lighting, Room, furnished_room, texture_detail
 from cohdc_train.synth.sensor import exposure, photograph, smear
 from cohdc_train.synth.streams import stream
 
@@ -113,7 +113,7 @@ def _developed(rgb: Floats, rng: np.random.Generator, size: tuple[int, int]) -> 
     scale = size[1] / 256
     if rng.random() < 0.33:
         rgb = smear(rgb, SUPERSAMPLING * scale * float(rng.uniform(1.5, 6)), float(rng.uniform(0, np.pi)))
-    small = cv2.resize(rgb, (size[1], size[0]), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(rgb, (size[1], size[0]), interpolation=cv2.INTER_AREA).astype(np.float32)
     return photograph(small, rng, float(rng.uniform(0.5, 3.5)), float(rng.uniform(0, 0.5)))
 
 
@@ -167,10 +167,9 @@ def _render_split(folder: Path, split: str, number: int, size: tuple[int, int], 
     """Write one split's images; returns its COCO document."""
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    detail = 512 if max(size) <= 320 else 1024
     for first in range(0, number, IMAGES_PER_ROOM):
         rng = stream(seed, f"coco-{split}", first // IMAGES_PER_ROOM)
-        stage = draw_stage(rng, detail)
+        stage = draw_stage(rng, texture_detail(size))
         for image_id in range(first + 1, min(first + IMAGES_PER_ROOM, number) + 1):
             picture = take_picture(stage, rng, size)
             name = f"{split}_{image_id:06d}.jpg"

@@ -60,7 +60,8 @@ def grid(points: Floats, texture: int, closed: bool) -> Mesh:
     """The surface through a grid of points, smooth normals.
 
     points: [R, S, 3] m. closed: the last column meets the first (a tube); uv then runs once around along u.
-    Normals of a closed surface point away from the line through the rings' centres.
+    Normals of a closed surface point away from the line through the rings' centres, those of an open one to where u is
+    seen running to the right and v down.
     """
     ring = np.concatenate([points, points[:, :1]], axis=1) if closed else points
     faces, uv = _topology(ring.shape[0], ring.shape[1])
@@ -70,7 +71,7 @@ def grid(points: Floats, texture: int, closed: bool) -> Mesh:
         around = wrapped[:, 2:] - wrapped[:, :-2]
     else:
         around = _differences(ring.transpose(1, 0, 2)).transpose(1, 0, 2)
-    normals = _cross(around, along)
+    normals = _cross(along, around)
     normals /= np.maximum(np.sqrt(np.einsum("rsk,rsk->rs", normals, normals))[..., None], 1e-12)
     if closed:
         outward = points - points.mean(axis=1, keepdims=True)
@@ -97,13 +98,15 @@ def _topology(rows: int, columns: int) -> tuple[NDArray[np.int64], Floats]:
 
 def _unit(vectors: Floats) -> Floats:
     """[n, 3] scaled to length 1."""
-    return vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
+    scaled: Floats = vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
+    return scaled
 
 
 def _differences(rows: Floats) -> Floats:
     """Central differences along the first axis (one-sided at its ends), up to a factor."""
     padded = np.concatenate([rows[:1], rows, rows[-1:]])
-    return padded[2:] - padded[:-2]
+    differences: Floats = padded[2:] - padded[:-2]
+    return differences
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
@@ -111,7 +114,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def quad(origin: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, texture: int) -> Mesh:
-    """A parallelogram from `origin` [3] m along `edge_u` (u 0..1) and `edge_v` (v 0..1)."""
+    """A parallelogram from `origin` [3] m along `edge_u` (u 0..1) and `edge_v` (v 0..1), facing as `grid` says."""
     o, a, b = (np.asarray(p, dtype=np.float32) for p in (origin, edge_u, edge_v))
     return grid(np.stack([np.stack([o, o + a]), np.stack([o + b, o + a + b])]), texture, closed=False)
 

@@ -17,7 +17,8 @@ def _sway(rng: np.random.Generator, times: Doubles, amplitude: float, period: fl
     first, second = rng.uniform(0, 2 * np.pi, 2)
     period = period * rng.uniform(0.9, 1.1)
     slow, fast = 2 * np.pi / period, 2 * np.pi / (0.37 * period)
-    return amplitude * (0.9 * np.sin(slow * times + first) + 0.1 * np.sin(fast * times + second))
+    swing: Doubles = amplitude * (0.9 * np.sin(slow * times + first) + 0.1 * np.sin(fast * times + second))
+    return swing
 
 
 def camera_path(rng: np.random.Generator, times: Doubles, motion: CameraMotion, eye: Doubles) -> Doubles:
@@ -58,7 +59,10 @@ def _euler(angles: Doubles) -> Doubles:
 
 @dataclass(frozen=True)
 class Walk:
-    """One person's way. position: [n, 2] m; heading: [n] rad; travelled: [n] m; pace: [n] 0 = stands, 1 = walks."""
+    """One person's way.
+
+    position: [n, 2] m from the eye; heading: [n] rad; travelled: [n] m; pace: [n] 0 = stands, 1 = walks.
+    """
 
     position: Doubles
     heading: Doubles
@@ -66,23 +70,24 @@ class Walk:
     pace: Doubles
 
 
-def walk(rng: np.random.Generator, times: Doubles, distances: tuple[float, float], eye: Doubles, reach: float) -> Walk:
-    """A person who crosses the view again and again, mostly in one direction, sometimes stopping or coming nearer.
+def walk(rng: np.random.Generator, times: Doubles, distances: tuple[float, float], usual: float, reach: float) -> Walk:
+    """A person who crosses the view again and again, slowly, now and then stopping.
 
-    times: [n] s, even steps; distances: nearest and farthest way in front of `eye` [3], m; reach: how far to the side
-    of the view's half width a crossing begins and ends, m. Between two crossings the person is out of sight.
+    times: [n] s, even steps; distances: nearest and farthest way in front of the eye, m; usual: +1 or -1, the direction
+    of five crossings in six (a crowd that moves one way is what misleads a camera); reach: how far beyond the border of
+    the view a crossing begins and ends, m. Between two crossings the person is out of sight. Positions are offsets from
+    the eye; the first crossing is already under way.
     """
-    step = float(times[1] - times[0]) if len(times) > 1 else 1 / 30
-    usual = 1.0 if rng.random() < 0.5 else -1.0
+    step = float(times[1] - times[0])
     pieces: list[Doubles] = []
     headings: list[Doubles] = []
     missing = len(times)
-    skipped = int(rng.integers(0, round(1.6 / step)))
     while missing > 0:
-        direction = usual if rng.random() < 0.75 else -usual
-        path = _crossing(rng, step, direction, distances, reach)[skipped:]
-        skipped = 0
-        velocity = np.gradient(path, axis=0) if len(path) > 1 else np.array([[direction, 0.0]])
+        direction = usual if rng.random() < 5 / 6 else -usual
+        path = _crossing(rng, step, direction, distances, reach)
+        if not pieces:
+            path = path[int(len(path) * rng.uniform(0.2, 0.55)) :]
+        velocity = np.gradient(path, axis=0)
         moving = np.abs(velocity[:, 0]) > 1e-4
         angle = np.where(moving, np.arctan2(velocity[:, 1], velocity[:, 0]), 0.0 if direction > 0 else np.pi)
         pieces.append(path[:missing])
@@ -91,8 +96,8 @@ def walk(rng: np.random.Generator, times: Doubles, distances: tuple[float, float
     offsets = np.concatenate(pieces)
     steps = np.linalg.norm(np.diff(offsets, axis=0, prepend=offsets[:1]), axis=1)
     steps[steps > 0.2] = 0.0  # from the end of a crossing to the start of the next, out of sight
-    pace = np.clip(steps / step / 0.7, 0, 1.15)
-    return Walk(offsets + eye[:2], np.concatenate(headings), np.cumsum(steps), pace)
+    pace = np.clip(steps / step / 0.5, 0, 1.15)
+    return Walk(offsets, np.concatenate(headings), np.cumsum(steps), pace)
 
 
 def _crossing(
@@ -101,7 +106,7 @@ def _crossing(
     """[k, 2] offsets from the eye on one way through the view, at even time steps."""
     start, end = rng.uniform(*distances, 2)
     half = 0.62 * max(start, end) + reach
-    pace = rng.uniform(0.75, 1.15)
+    pace = rng.uniform(0.45, 0.85)
     stop = rng.uniform(-0.4, 0.4) * min(start, end)
     pause = rng.uniform(0.8, 1.6) if rng.random() < 0.4 else 0.0
     first, last = (stop + half) / pace, (half - stop) / pace

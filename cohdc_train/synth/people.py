@@ -49,12 +49,12 @@ class Pose:
     nod: float
 
 
-def draw_person(rng: np.random.Generator) -> Person:
-    """A random adult or teenager with clothes."""
+def draw_person(rng: np.random.Generator, patterned: float = 0.6) -> Person:
+    """A random adult or teenager with clothes; `patterned` is the chance of a shirt with a pattern."""
     tone, hair = clothes.skin_tone(rng), clothes.hair_colour(rng)
     looks = (
-        clothes.cloth(rng, 0.65),
-        clothes.cloth(rng, 0.25),
+        clothes.cloth(rng, patterned),
+        clothes.cloth(rng, patterned / 2),
         clothes.skin(rng, tone),
         clothes.face(rng, tone, hair),
         clothes.hair(rng, hair),
@@ -161,8 +161,8 @@ def _trunk(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]
     level = np.array([-person.coat, 0.02, 0.08, 0.15, 0.22, 0.27, 0.295, 0.315], dtype=np.float32)
     wide = np.array([0.108, 0.104, 0.094, 0.1, 0.11, 0.108, 0.075, 0.03], dtype=np.float32)
     deep = np.array([0.082, 0.076, 0.066 * belly, 0.068, 0.07, 0.062, 0.048, 0.03], dtype=np.float32)
-    chest = np.where(level[:, None] > 0, level[:, None] * spine, level[:, None] * up) * h
-    parts = [solids.tube(chest, np.stack([wide, deep], 1) * g, LEFT, SHIRT, segments=16)]
+    chest = (np.where(level[:, None] > 0, level[:, None] * spine, level[:, None] * up) * h).astype(np.float32)
+    parts = [solids.tube(chest, (np.stack([wide, deep], 1) * g).astype(np.float32), LEFT, SHIRT, segments=16)]
     fall, width = np.array([0.04, 0.0, -0.06, -0.1]), np.array([0.09, 0.104, 0.1, 0.05])
     if person.legwear == "skirt":
         reach = max(abs(np.sin(a)) for a in pose.hips) * 0.2

@@ -86,7 +86,8 @@ class Atlas:
         self.image: Texture = np.zeros((y + shelf, self._WIDTH, 3), dtype=np.uint8)
         self.levels = np.array([int(np.log2(min(t.shape[:2]))) - 1 for t in textures], dtype=np.int32)
         self.size = np.array([[t.shape[1], t.shape[0]] for t in textures], dtype=np.float32)
-        self.corner = np.zeros((len(textures), int(self.levels.max()), 2), dtype=np.float32)
+        # per texture and level: left, top, width - 1, height - 1 of the copy, px of the atlas
+        self.copies = np.zeros((len(textures), int(self.levels.max()), 4), dtype=np.float32)
         for k, (left, top) in places.items():
             self._place(k, textures[k], left, top)
 
@@ -95,19 +96,19 @@ class Atlas:
         for level in range(int(self.levels[k])):
             height, width = image.shape[:2]
             self.image[y : y + height, x : x + width] = image
-            self.corner[k, level] = (x, y)
+            self.copies[k, level] = (x, y, width - 1, height - 1)
             x, y = (left + width, top) if level == 0 else (x, y + height)
-            image = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+            image = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
     def sample(self, texture: NDArray[np.int32], uv: Floats, footprint: Floats, columns: int) -> Floats:
         """[N, 3] float32 0..1 colours. uv: [N, 2]; footprint: [N] texels of the full texture a pixel covers."""
-        level = np.rint(np.log2(np.maximum(footprint, 1.0))).astype(np.int32)
+        level = np.rint(np.log2(np.maximum(footprint, 1))).astype(np.int32)
         level = np.minimum(level, self.levels[texture] - 1)
-        size = self.size[texture] * np.exp2(-level.astype(np.float32))[:, None]
-        inside = np.minimum(np.maximum(uv * size - 0.5, 0), size - 1)
-        place = (self.corner[texture, level] + inside).reshape(-1, columns, 2)
-        found = cv2.remap(self.image, place, None, cv2.INTER_LINEAR)
-        return found.reshape(-1, 3).astype(np.float32) * np.float32(1 / 255)
+        copy = np.take(self.copies.reshape(-1, 4), texture * self.copies.shape[1] + level, axis=0)
+        x = (copy[:, 0] + uv[:, 0] * copy[:, 2]).reshape(-1, columns)
+        y = (copy[:, 1] + uv[:, 1] * copy[:, 3]).reshape(-1, columns)
+        found = cv2.remap(self.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
+        return found.reshape(-1, 3) * np.float32(1 / 255)
 
 
 @lru_cache(maxsize=4)
@@ -146,11 +147,12 @@ def render(mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: N
     met = hits.triangle >= 0
     depth = np.where(met, hits.depth, 0).astype(np.float32)
     normal = _interpolated(mesh.normals, triangle, hits.weights)
-    slant = _dot(normal, hits.directions) / np.maximum(np.sqrt(_dot(normal, normal)), 1e-9)
-    normal /= np.copysign(np.maximum(np.sqrt(_dot(normal, normal)), 1e-9), -slant)[:, None]
-    facing = np.abs(slant) / np.sqrt(_dot(hits.directions, hits.directions))
+    normal /= np.maximum(np.sqrt(_dot(normal, normal)), np.float32(1e-9))[:, None]
+    lengths = np.sqrt(_dot(hits.directions, hits.directions))
+    facing: Floats = np.maximum(-_dot(normal, hits.directions) / lengths, 0)
     uv = _interpolated(mesh.uv, triangle, hits.weights)
-    footprint = depth / np.float32(camera.fx) * _density(mesh, atlas)[triangle] / np.sqrt(np.maximum(facing, 0.1))
+    texels = _density(mesh, atlas)[triangle] / np.sqrt(np.maximum(facing, np.float32(0.1)))
+    footprint: Floats = (depth / np.float32(camera.fx) * texels).astype(np.float32, copy=False)
     albedo = atlas.sample(mesh.texture[triangle], uv, footprint, camera.width)
     position = hits.directions * depth[:, None] + T_wc[:3, 3].astype(np.float32)
     rgb = albedo * _light(position, normal, lighting) * met[:, None]
@@ -175,17 +177,19 @@ def _density(mesh: Mesh, atlas: Atlas) -> Floats:
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     spans = (mesh.uv[:, 1:] - mesh.uv[:, :1]) * atlas.size[mesh.texture][:, None]
     texels = np.abs(spans[:, 0, 0] * spans[:, 1, 1] - spans[:, 0, 1] * spans[:, 1, 0])
-    return np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
+    density: Floats = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
+    return density
 
 
 def _light(position: Floats, normal: Floats, lighting: Lighting) -> Floats:
     """[N, 3] light that falls on every point: ambient, stronger from above, and lamps with a falloff."""
-    total: Floats = lighting.ambient * (0.82 + 0.18 * normal[:, 2:])
-    for lamp, power in zip(lighting.lamps, lighting.power, strict=True):
-        ray = lamp - position
-        square = np.maximum(_dot(ray, ray), np.float32(1e-6))
-        cosine = np.maximum(_dot(ray, normal), 0)
-        total += power * (cosine / (np.sqrt(square) * (1 + np.float32(0.12) * square)))[:, None]
+    lamps = lighting.lamps.T
+    cosine = np.maximum(normal @ lamps - _dot(normal, position)[:, None], 0)
+    square = _dot(position, position)[:, None] - 2 * (position @ lamps) + (lamps * lamps).sum(0)
+    square = np.maximum(square, np.float32(1e-4))
+    cosine /= np.sqrt(square) * (1 + np.float32(0.12) * square)
+    total: Floats = cosine @ lighting.power
+    total += lighting.ambient * (np.float32(0.82) + np.float32(0.18) * normal[:, 2:])
     return total
 
 

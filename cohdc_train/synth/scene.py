@@ -71,7 +71,7 @@ class _Builder:
         sides = [self.add_texture(_cornered(maker(rng, d // 2, d))) for maker in walls]
         self.floor = self.add_texture(low)
         self.parts += [
-            solids.quad((-w / 2, 0, 0), (w, 0, 0), (0, length, 0), self.floor),
+            solids.quad((-w / 2, length, 0), (w, 0, 0), (0, -length, 0), self.floor),
             solids.quad((-w / 2, 0, h), (w, 0, 0), (0, length, 0), self.add_texture(high)),
             solids.quad((-w / 2, length, h), (w, 0, 0), (0, 0, -h), sides[0]),
             solids.quad((w / 2, 0, h), (-w, 0, 0), (0, 0, -h), sides[1]),
@@ -94,9 +94,10 @@ class _Builder:
                 left = x - wide / 2 + self.rng.uniform(-0.15, 0.15)
                 if wall == 0:
                     part = solids.quad((left - w / 2, length - 0.02, z), (wide, 0, 0), (0, 0, -tall), look)
+                elif wall == 1:
+                    part = solids.quad((0.02 - w / 2, left, z), (0, wide, 0), (0, 0, -tall), look)
                 else:
-                    sign = -1.0 if wall == 1 else 1.0
-                    part = solids.quad((sign * (w / 2 - 0.02), left, z), (0, wide, 0), (0, 0, -tall), look)
+                    part = solids.quad((w / 2 - 0.02, left + wide, z), (0, -wide, 0), (0, 0, -tall), look)
                 self.parts.append(part)
 
     def shelf(self, x: float, y: float, yaw: float) -> None:
@@ -181,7 +182,14 @@ def _cornered(image: Texture) -> Texture:
     x = np.minimum(np.arange(width), np.arange(width)[::-1]) / width
     y = np.minimum(np.arange(height), np.arange(height)[::-1]) / height
     shade = (1 - 0.3 * np.exp(-x / 0.05))[None] * (1 - 0.3 * np.exp(-y / 0.06))[:, None]
-    return np.clip(image * shade[..., None], 0, 255).astype(np.uint8)
+    darkened: Texture = np.clip(image * shade[..., None], 0, 255).astype(np.uint8)
+    return darkened
+
+
+def texture_detail(size: tuple[int, int]) -> int:
+    """The side of the largest texture, px, that images of `size` (height, width) can show."""
+    widest = max(size)
+    return 1024 if widest > 320 else 512 if widest > 160 else 256
 
 
 def furnished_room(
@@ -219,8 +227,8 @@ def _shade_floor(floor: Texture, footprints: NDArray[np.float32], size: tuple[fl
     shadow = np.ones((height, width), dtype=np.float32)
     scale = np.array([width / size[0], height / size[1]])
     for x, y, half_x, half_y in footprints:
-        low = (np.array([x - half_x + size[0] / 2, y - half_y]) * scale).astype(int)
-        high = (np.array([x + half_x + size[0] / 2, y + half_y]) * scale).astype(int)
+        low = (np.array([x - half_x + size[0] / 2, size[1] - y - half_y]) * scale).astype(int)
+        high = (np.array([x + half_x + size[0] / 2, size[1] - y + half_y]) * scale).astype(int)
         shadow[max(low[1], 0) : high[1], max(low[0], 0) : high[0]] = 0.45
-    shadow = cv2.GaussianBlur(shadow, (0, 0), 0.18 * float(scale[0]))
-    floor[:] = (floor * shadow[..., None]).astype(np.uint8)
+    soft = cv2.GaussianBlur(shadow, (0, 0), 0.18 * float(scale[0]))
+    floor[:] = (floor * soft[..., None]).astype(np.uint8)

@@ -36,8 +36,7 @@ def smear(rgb: Floats, length: float, angle: float) -> Floats:
     dx, dy = half * np.cos(angle), half * np.sin(angle)
     ends = ((round(half - dx), round(half - dy)), (round(half + dx), round(half + dy)))
     cv2.line(kernel, ends[0], ends[1], (1.0,), 1, cv2.LINE_8)
-    smeared: Floats = cv2.filter2D(rgb, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
-    return smeared
+    return cv2.filter2D(rgb, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE).astype(np.float32)
 
 
 def depth_edges(depth: Floats) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,18 +12,20 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.synth import people as bodies
 from cohdc_train.synth.folder import new_folder
-from cohdc_train.synth.mesh import Mesh, join
+from cohdc_train.synth.mesh import Mesh, join, yaw_rotation
 from cohdc_train.synth.motion import MOTIONS, CameraMotion, Doubles, Walk, camera_path, walk
 from cohdc_train.synth.renderer import Atlas, Camera, View, instances, render
-from cohdc_train.synth.scene import Room, furnished_room
+from cohdc_train.synth.scene import Room, furnished_room, texture_detail
 from cohdc_train.synth.sensor import DEPTH_SCALE, exposure, measure_depth, photograph
 from cohdc_train.synth.streams import stream
 
 RATE = 30.0  # frames per second
 FIRST_STAMP = 1305031102.175304  # s
 TRUTH_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own stamp
-SHARE = (0.24, 0.36)  # mean share of person pixels a scene is drawn for
+SHARE = (0.28, 0.38)  # mean share of person pixels a scene is drawn for
 PEAK = 0.6  # share of person pixels no frame should exceed
+_DRAWS = 16  # how often the ways are drawn anew to get there
+_REACH = {"xyz": 0.85, "halfsphere": 1.4, "static": 0.6, "rpy": 1.4}  # m beyond the view's border where people turn
 _EYE_Y = 0.9  # m from the wall behind the camera
 
 
@@ -51,7 +54,7 @@ class Scene:
         for k, (person, way) in enumerate(zip(self.people, self.walks, strict=True)):
             phase = 2 * np.pi * way.travelled[frame] / bodies.stride(person)
             pose = bodies.walking(float(phase), float(way.pace[frame]))
-            place = (float(way.position[frame, 0]), float(way.position[frame, 1]))
+            place = (float(way.position[frame, 0]), float(way.position[frame, 1]) + _EYE_Y)
             mesh = bodies.person_mesh(person, pose, place, float(way.heading[frame]))
             meshes.append(mesh.named(k + 1, first + k * len(person.textures)))
         return meshes
@@ -66,28 +69,29 @@ class Scene:
         return render(mesh, atlas, self.room.lighting, self.camera, self.poses[frame])
 
 
-def draw_scene(
-    seed: int, frames: int, size: tuple[int, int], motion: CameraMotion, people: int, detail: int = 1024
-) -> Scene:
+def draw_scene(seed: int, frames: int, size: tuple[int, int], motion: CameraMotion, people: int) -> Scene:
     """Draw the room, the camera's path and the people's ways, so that people cover 20-40 % of the pixels on average.
 
     size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of them fits SHARE and
-    PEAK; the best of twelve is taken.
+    PEAK; the best is taken.
     """
     rng = stream(seed, "sequence")
-    room = furnished_room(rng, (7.5, float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8))), 3.4, detail)
+    room = furnished_room(
+        rng, (7.5, float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8))), 3.4, texture_detail(size)
+    )
     fine = np.arange(TRUTH_PER_FRAME * (frames - 1) + 1) / (RATE * TRUTH_PER_FRAME)
     eye = np.array([0.0, _EYE_Y, rng.uniform(1.25, 1.5)])
     truth = camera_path(rng, fine, motion, eye)
-    cast = tuple(bodies.draw_person(rng) for _ in range(people))
-    reach = 1.6 if motion in ("rpy", "halfsphere") else 1.0
+    cast = tuple(bodies.draw_person(rng, patterned=1.0) for _ in range(people))
+    usual = float(rng.choice([-1.0, 1.0]))
+    figures = [bodies.person_mesh(person, bodies.walking(0.6), (0.0, 0.0), 0.0) for person in cast]
     nearest = 1.3
     best: tuple[float, Scene] | None = None
-    for _ in range(12 if people else 1):
-        lanes = [(nearest + 0.45 * k, nearest + 0.45 * k + 0.2) for k in rng.permutation(people)]
-        walks = tuple(walk(rng, fine[::TRUTH_PER_FRAME], lane, eye, reach) for lane in lanes)
+    for _ in range(_DRAWS if people else 1):
+        lanes = [(nearest + 0.4 * k, nearest + 0.4 * k + 0.2) for k in rng.permutation(people)]
+        walks = tuple(walk(rng, fine[::TRUTH_PER_FRAME], lane, usual, _REACH[motion]) for lane in lanes)
         scene = Scene(room, cast, walks, Camera.freiburg3(size), truth)
-        shares = _coarse_shares(scene)
+        shares = _coarse_shares(scene, figures)
         mean, peak = float(shares.mean()), float(shares.max())
         cost = max(SHARE[0] - mean, mean - SHARE[1], 0.0) + 0.5 * max(peak - PEAK, 0.0)
         if best is None or cost < best[0]:
@@ -99,13 +103,21 @@ def draw_scene(
     return best[1]
 
 
-def _coarse_shares(scene: Scene) -> Doubles:
-    """Share of person pixels in every fifth frame, from 80 x 60 rays without the room."""
-    if not scene.people:
+def _coarse_shares(scene: Scene, figures: list[Mesh]) -> Doubles:
+    """Share of person pixels in every eighth frame, 80 px wide: `figures` are the people in one fixed pose; no room."""
+    if not figures:
         return np.zeros(1)
     coarse = scene.camera.resized(80 / scene.camera.width)
-    frames = range(0, len(scene.poses), 5)
-    return np.array([np.mean(instances(join(scene.crowd(k)), coarse, scene.poses[k]) > 0) for k in frames])
+    shares = []
+    for k in range(0, len(scene.poses), 8):
+        crowd = [
+            figure.moved(yaw_rotation(way.heading[k]), (way.position[k, 0], way.position[k, 1] + _EYE_Y, 0.0)).named(
+                1, 0
+            )
+            for figure, way in zip(figures, scene.walks, strict=True)
+        ]
+        shares.append(np.mean(instances(join(crowd), coarse, scene.poses[k]) > 0))
+    return np.array(shares)
 
 
 def sequence(
@@ -136,7 +148,13 @@ def sequence(
         _write_lists(draft, frames, title)
         _write_truth(draft / "groundtruth.txt", scene.truth, title)
         _write_camera(draft / "camera.yaml", scene.camera)
-        info = {"seed": seed, "motion": motion, "people": people, "frames": frames, "size": list(size)}
+        info: dict[str, object] = {
+            "seed": seed,
+            "motion": motion,
+            "people": people,
+            "frames": frames,
+            "size": list(size),
+        }
         share = {"mean": float(shares.mean()), "min": float(shares.min()), "max": float(shares.max())}
         info |= {"share": share, "share_per_frame": [round(float(s), 5) for s in shares]}
         (draft / "info.json").write_text(json.dumps(info, indent=1) + "\n")
@@ -180,8 +198,8 @@ def _write_frames(folder: Path, scene: Scene, seed: int) -> Doubles:
     return np.array(shares)
 
 
-def _write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, 2]):
         raise DataError(f"{path}: cannot be written")
 
 
