@@ -14,6 +14,7 @@ from cohdc_train.slam.optimization import (
     pose_jacobian,
     residual_jacobian,
     residuals,
+    to_local,
 )
 
 _BLAS_SERIAL = 200_000  # multiplications; OpenBLAS starts threads at 262144
@@ -56,8 +57,12 @@ class _Normal:
 
 def local_points(poses: Array, points: Array, problem: Problem) -> Array:
     """[m, 3] each measured point in the frame of the camera that saw it, m."""
-    R, t = poses[problem.cameras, :3, :3], poses[problem.cameras, :3, 3]
-    return np.asarray(np.einsum("mij,mj->mi", R, points[problem.points]) + t)
+    result = np.empty((len(problem.points), 3))
+    ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
+    for camera, pose in enumerate(poses):
+        rows = slice(ends[camera], ends[camera + 1])
+        result[rows] = to_local(pose, points[problem.points[rows]])
+    return result
 
 
 def measurement_chi2(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Array:

@@ -63,7 +63,7 @@ class FeatureExtractor:
         self, rgb: NDArray[np.uint8], depth: NDArray[np.float32], mask: NDArray[np.bool_] | None = None
     ) -> Features:
         """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there."""
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found = self._detect(gray, allowed)
         table = np.array([(*k.pt, k.octave, k.response) for k in found], dtype=np.float64).reshape(-1, 4)

@@ -64,7 +64,7 @@ def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
     poses, points = np.stack([k.T_cw for k in window]), world.positions[ids]
     poses, points = adjust(poses, points, problem, weighing, steps=5)
     good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
-    poses, points = adjust(poses, points, problem.take(good), weighing, steps=5, robust=False)
+    poses, points = adjust(poses, points, problem.take(good), weighing, steps=3, robust=False)
     good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
     world.positions[ids] = points
     for slot, member in enumerate(window):

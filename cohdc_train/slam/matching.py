@@ -43,9 +43,10 @@ class Projected:
 def match_projected(
     projected: Projected, features: Features, radius: float, max_distance: int = 90, ratio: float = 0.9
 ) -> Matches:
-    """Nearest descriptor among the corners within `radius` px (times the corner's scale, up to 2) and one level of each point.
+    """Nearest descriptor among the corners near each point: within one level and `radius` px.
 
-    max_distance: bits; ratio: the best must beat this share of the second best. One corner takes one point.
+    radius: px at level 0, growing with the corner's scale up to twofold; max_distance: bits; ratio: the best must beat
+    this share of the second best. One corner takes one point.
     """
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
