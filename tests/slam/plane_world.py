@@ -1,6 +1,7 @@
 """A cheap world for tests: textured rectangles seen by a pinhole camera, colour and depth exact to the pixel."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ def texture(rng: np.random.Generator, height: int, width: int, patches: int = 90
     return cv2.GaussianBlur(image, (3, 3), 0)
 
 
+@cache
 def room(seed: int = 0) -> list[Rectangle]:
     """A wall 2.6 m away, a floor, and a box standing before them."""
     rng = np.random.default_rng(seed)
@@ -50,9 +52,14 @@ def room(seed: int = 0) -> list[Rectangle]:
 def passer_by(step: int, seed: int = 7) -> Rectangle:
     """A textured board before the camera that goes along with step: the worst kind of mover, full of corners."""
     left = -1.0 + 0.03 * step
-    rng = np.random.default_rng(seed)
-    board = texture(rng, 300, 140, patches=400)
-    return Rectangle(np.array([left, -0.7, 1.6]), np.array([0.65, 0, 0]), np.array([0, 1.4, 0]), board, moving=True)
+    return Rectangle(
+        np.array([left, -0.7, 1.6]), np.array([0.65, 0, 0]), np.array([0, 1.4, 0]), _board(seed), moving=True
+    )
+
+
+@cache
+def _board(seed: int) -> NDArray[np.uint8]:
+    return texture(np.random.default_rng(seed), 300, 140, patches=400)
 
 
 def camera_path(frames: int) -> NDArray[np.float64]:
@@ -68,7 +75,6 @@ def render(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
     """Colour [H, W, 3], depth [H, W] m (0 where nothing is hit), and where moving things are seen [H, W]."""
     T_cw = np.linalg.inv(T_wc)
-    size = (camera.width, camera.height)
     rgb = np.full((camera.height, camera.width, 3), 90, dtype=np.uint8)
     nearest = np.full((camera.height, camera.width), np.inf)
     moving = np.zeros((camera.height, camera.width), dtype=np.bool_)
@@ -86,7 +92,6 @@ def render(
         seen = (a >= 0) & (a < 1) & (b >= 0) & (b < 1) & (depth > 0.1) & (depth < nearest)
         sampled = cv2.remap(item.texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         rgb[seen], nearest[seen], moving[seen] = sampled[seen], depth[seen], item.moving
-    assert rgb.shape[:2] == size[::-1]
     return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
 
 
