@@ -7,6 +7,7 @@ from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.optimization import Array, Observations
 
 _NEAR = 0.05  # m
+_PIXEL_TOLERANCE = 3.0  # px at pyramid level 0
 _DEPTH_TOLERANCE = 0.1  # of the depth: a match whose measured depth is further off does not agree
 
 
@@ -30,12 +31,11 @@ def ransac_pose(
     camera: Camera,
     rng: np.random.Generator,
     hypotheses: int = 64,
-    tolerance: float = 3.0,
     guess: Array | None = None,
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """The pose most matches agree with.
 
-    points: [m, 3] world, m; seen: what the camera measured of them; tolerance: px at pyramid level 0; guess: [4, 4]
+    points: [m, 3] world, m; seen: what the camera measured of them; guess: [4, 4]
     T_cw that competes with the random hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer than three
     matches that have depth and no guess.
     """
@@ -49,7 +49,7 @@ def ransac_pose(
     if not poses:
         return None
     candidates = np.concatenate(poses)
-    agree = _agreement(candidates, points, seen, camera, tolerance)
+    agree = _agreement(candidates, points, seen, camera)
     best = int(np.argmax(agree.sum(axis=1)))
     return candidates[best], agree[best]
 
@@ -60,6 +60,6 @@ def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera, 
     z = np.maximum(local[..., 2], _NEAR)
     error_u = camera.fx * local[..., 0] / z + camera.cx - seen.pixels[:, 0]
     error_v = camera.fy * local[..., 1] / z + camera.cy - seen.pixels[:, 1]
-    agree = error_u**2 + error_v**2 <= (tolerance * seen.sigmas) ** 2
+    agree = error_u**2 + error_v**2 <= (_PIXEL_TOLERANCE * seen.sigmas) ** 2
     agree &= ~(np.abs(local[..., 2] - seen.depths) > _DEPTH_TOLERANCE * z)  # a depth of nan disagrees with nothing
     return np.asarray(agree & (local[..., 2] > _NEAR))
