@@ -35,9 +35,9 @@ def ransac_pose(
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """The pose most matches agree with.
 
-    points: [m, 3] world, m; seen: what the camera measured of them; guess: [4, 4]
-    T_cw that competes with the random hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer than three
-    matches that have depth and no guess.
+    points: [m, 3] world, m; seen: what the camera measured of them; guess: [4, 4] T_cw that competes with
+    the random hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer than three matches that have depth
+    and no guess.
     """
     poses = [] if guess is None else [guess[None]]
     with_depth = np.flatnonzero(~np.isnan(seen.depths))
@@ -54,7 +54,7 @@ def ransac_pose(
     return candidates[best], agree[best]
 
 
-def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera, tolerance: float) -> NDArray[np.bool_]:
+def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera) -> NDArray[np.bool_]:
     """[h, m] whether a match agrees with a hypothesis, in pixels and, where measured, in depth."""
     local = points[None] @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     z = np.maximum(local[..., 2], _NEAR)
