@@ -62,6 +62,8 @@ def slam(
     """
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
+    if not sequence.is_dir():
+        raise DataError(f"{sequence}: no such folder")
     check_out(out)
     intrinsics, origin = choose_camera(sequence, camera)
     pairs = read_sequence(sequence)

@@ -126,6 +126,11 @@ def test_model_and_masks_together_are_refused(tmp_path: Path) -> None:
         slam(sequence=tmp_path, out=tmp_path / "o", model=tmp_path / "m.onnx", masks=tmp_path)
 
 
+def test_a_missing_sequence_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"gone: no such folder"):
+        slam(sequence=tmp_path / "gone", out=tmp_path / "out")
+
+
 def test_out_must_not_be_a_file(tmp_path: Path) -> None:
     (tmp_path / "out").touch()
     with pytest.raises(DataError, match="is a file"):
