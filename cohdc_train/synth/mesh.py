@@ -28,7 +28,8 @@ class Mesh:
         """The mesh in another frame: rotation [3, 3], translation [3] m."""
         turn = np.asarray(rotation, dtype=np.float32).T
         shift = np.asarray(translation, dtype=np.float32)
-        return replace(self, corners=self.corners @ turn + shift, normals=self.normals @ turn)
+        corners = (self.corners.reshape(-1, 3) @ turn + shift).reshape(-1, 3, 3)
+        return replace(self, corners=corners, normals=(self.normals.reshape(-1, 3) @ turn).reshape(-1, 3, 3))
 
     def named(self, instance: int, first_texture: int) -> "Mesh":
         """The mesh as instance number `instance`, its textures starting at `first_texture` of a longer list."""

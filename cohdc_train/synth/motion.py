@@ -70,13 +70,15 @@ class Walk:
     pace: Doubles
 
 
-def walk(rng: np.random.Generator, times: Doubles, distances: tuple[float, float], usual: float, reach: float) -> Walk:
+def walk(
+    rng: np.random.Generator, times: Doubles, distances: tuple[float, float], usual: float, reach: float, start: float
+) -> Walk:
     """A person who crosses the view again and again, slowly, now and then stopping.
 
     times: [n] s, even steps; distances: nearest and farthest way in front of the eye, m; usual: +1 or -1, the direction
     of five crossings in six (a crowd that moves one way is what misleads a camera); reach: how far beyond the border of
-    the view a crossing begins and ends, m. Between two crossings the person is out of sight. Positions are offsets from
-    the eye; the first crossing is already under way.
+    the view a crossing begins and ends, m; start: the part 0..1 of the first crossing that is over at the beginning.
+    Between two crossings the person is out of sight.
     """
     step = float(times[1] - times[0])
     pieces: list[Doubles] = []
@@ -86,7 +88,7 @@ def walk(rng: np.random.Generator, times: Doubles, distances: tuple[float, float
         direction = usual if rng.random() < 5 / 6 else -usual
         path = _crossing(rng, step, direction, distances, reach)
         if not pieces:
-            path = path[int(len(path) * rng.uniform(0.2, 0.55)) :]
+            path = path[int(len(path) * start) :]
         velocity = np.gradient(path, axis=0)
         moving = np.abs(velocity[:, 0]) > 1e-4
         angle = np.where(moving, np.arctan2(velocity[:, 1], velocity[:, 0]), 0.0 if direction > 0 else np.pi)
@@ -95,7 +97,7 @@ def walk(rng: np.random.Generator, times: Doubles, distances: tuple[float, float
         missing -= len(path)
     offsets = np.concatenate(pieces)
     steps = np.linalg.norm(np.diff(offsets, axis=0, prepend=offsets[:1]), axis=1)
-    steps[steps > 0.2] = 0.0  # from the end of a crossing to the start of the next, out of sight
+    steps[steps > 1.2 * step] = 0.0  # from the end of a crossing to the start of the next, out of sight
     pace = np.clip(steps / step / 0.5, 0, 1.15)
     return Walk(offsets, np.concatenate(headings), np.cumsum(steps), pace)
 

@@ -88,8 +88,17 @@ def draw_scene(seed: int, frames: int, size: tuple[int, int], motion: CameraMoti
     nearest = 1.3
     best: tuple[float, Scene] | None = None
     for _ in range(_DRAWS if people else 1):
-        lanes = [(nearest + 0.4 * k, nearest + 0.4 * k + 0.2) for k in rng.permutation(people)]
-        walks = tuple(walk(rng, fine[::TRUTH_PER_FRAME], lane, usual, _REACH[motion]) for lane in lanes)
+        walks = tuple(
+            walk(
+                rng,
+                fine[::TRUTH_PER_FRAME],
+                (d, d + 0.2),
+                usual,
+                _REACH[motion],
+                (turn + rng.uniform(0.1, 0.6)) / people,
+            )
+            for d, turn in zip(nearest + 0.4 * np.arange(people), rng.permutation(people), strict=True)
+        )
         scene = Scene(room, cast, walks, Camera.freiburg3(size), truth)
         shares = _coarse_shares(scene, figures)
         mean, peak = float(shares.mean()), float(shares.max())
@@ -104,12 +113,12 @@ def draw_scene(seed: int, frames: int, size: tuple[int, int], motion: CameraMoti
 
 
 def _coarse_shares(scene: Scene, figures: list[Mesh]) -> Doubles:
-    """Share of person pixels in every eighth frame, 80 px wide: `figures` are the people in one fixed pose; no room."""
+    """Share of person pixels in every tenth frame, 80 px wide: `figures` are the people in one fixed pose; no room."""
     if not figures:
         return np.zeros(1)
     coarse = scene.camera.resized(80 / scene.camera.width)
     shares = []
-    for k in range(0, len(scene.poses), 8):
+    for k in range(0, len(scene.poses), 10):
         crowd = [
             figure.moved(yaw_rotation(way.heading[k]), (way.position[k, 0], way.position[k, 1] + _EYE_Y, 0.0)).named(
                 1, 0
@@ -183,7 +192,7 @@ def _write_frames(folder: Path, scene: Scene, seed: int) -> Doubles:
     """Write rgb/, depth/ and masks/; returns the share of person pixels per frame."""
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir()
-    rng = stream(seed, "sequence", 1)
+    rng = stream(seed, "sequence", 2)
     atlas = scene.atlas()
     gain = np.float32(exposure(scene.view(0, atlas).rgb))
     shares = []

@@ -11,6 +11,8 @@ from hypothesis.extra.numpy import arrays
 from cohdc_train.synth.annotation import annotate, outlines, run_lengths
 
 mask_api = pytest.importorskip("pycocotools.mask")
+# pycocotools' arrays lack numpy 2's copy keyword
+pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 
 
 def decoded(segmentation: Any, shape: tuple[int, int]) -> np.ndarray:

@@ -15,6 +15,8 @@ from cohdc_train.synth.streams import stream
 
 pytest.importorskip("embreex")
 pycocotools = pytest.importorskip("pycocotools.coco")
+# pycocotools' arrays lack numpy 2's copy keyword
+pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 
 SIZE = (96, 128)
 

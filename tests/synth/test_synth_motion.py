@@ -34,11 +34,11 @@ def test_camera_moves_smoothly_about_the_eye(motion: str) -> None:
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), usual=st.sampled_from([-1.0, 1.0]))
 def test_people_walk_steadily_and_jump_only_out_of_sight(seed: int, usual: float) -> None:
-    way = walk(np.random.default_rng(seed), TIMES, (1.2, 1.6), usual, 0.85)
+    way = walk(np.random.default_rng(seed), TIMES, (1.2, 1.6), usual, 0.85, 0.3)
     assert way.position.shape == (300, 2)
     assert way.heading.shape == way.travelled.shape == way.pace.shape == (300,)
     step = np.linalg.norm(np.diff(way.position, axis=0), axis=1)
-    jumps = np.flatnonzero(step > 0.2)
+    jumps = np.flatnonzero(step > 1.2 / 30)
     for k in jumps:
         assert abs(way.position[k, 0]) > 0.62 * 1.2 + 0.5
         assert abs(way.position[k + 1, 0]) > 0.62 * 1.2 + 0.5
@@ -46,5 +46,5 @@ def test_people_walk_steadily_and_jump_only_out_of_sight(seed: int, usual: float
     assert np.all(np.diff(way.travelled) >= 0)
     assert np.all((way.position[:, 1] >= 1.2 - 1e-6) & (way.position[:, 1] <= 1.6 + 1e-6))
     forward = np.diff(way.position[:, 0])
-    walking = (step > 0.01) & (step < 0.2)
+    walking = (step > 0.01) & (step < 1.2 / 30)
     np.testing.assert_array_equal(np.sign(forward[walking]), np.sign(np.cos(way.heading[:-1][walking])))
