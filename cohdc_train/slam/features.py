@@ -66,13 +66,12 @@ class FeatureExtractor:
         gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found = self._detect(gray, allowed)
-        table = np.array([(*k.pt, k.octave, k.response) for k in found], dtype=np.float64).reshape(-1, 4)
+        table = np.column_stack([*_places(found), np.fromiter((k.response for k in found), float, len(found))])
         chosen = spread(table, self._quota)
         kept, words = self._detectors[0].compute(gray, [found[i] for i in chosen])
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
-        pixels = np.array([k.pt for k in kept], dtype=np.float64).reshape(-1, 2)
-        octaves = np.array([k.octave for k in kept], dtype=np.int64)
+        pixels, octaves = _places(kept)
         depths = sample_depth(depth, pixels, mask)
         descriptors = np.ascontiguousarray(words).view(np.uint64)
         return Features(pixels, self.camera.undistort(pixels), octaves, descriptors, depths)
@@ -81,6 +80,12 @@ class FeatureExtractor:
         """Strong corners, which are quick to find; where they do not suffice, weak ones too."""
         found = self._detectors[0].detect(gray, allowed)
         return found if len(found) >= _ENOUGH * self.budget else self._detectors[1].detect(gray, allowed)
+
+
+def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """[n, 2] px and [n] pyramid levels."""
+    pixels = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64).reshape(-1, 2)
+    return pixels, np.fromiter((k.octave for k in corners), np.int64, len(corners))
 
 
 def _orb(count: int, threshold: int) -> cv2.ORB:

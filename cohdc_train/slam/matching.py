@@ -51,8 +51,10 @@ def match_projected(
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     reach = radius * np.minimum(features.sigmas, _WIDEST)
-    tree = cKDTree(projected.pixels)
-    pairs = tree.sparse_distance_matrix(cKDTree(features.points), float(reach.max()), output_type="ndarray")
+    trees = [
+        cKDTree(points, compact_nodes=False, balanced_tree=False) for points in (projected.pixels, features.points)
+    ]
+    pairs = trees[0].sparse_distance_matrix(trees[1], float(reach.max()), output_type="ndarray")
     i, j = pairs["i"].astype(np.int64), pairs["j"].astype(np.int64)
     near = pairs["v"] <= reach[j]
     near &= np.abs(features.octaves[j] - projected.levels[i]) <= 1
