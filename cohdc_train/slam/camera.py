@@ -43,8 +43,10 @@ class Camera:
         coefficients = np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
         if not coefficients.any() or len(pixels) == 0:
             return np.asarray(pixels, dtype=np.float64).copy()
+        # The default stops at an error of 0.01 px and more in the corners of freiburg1.
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-6)
         points = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        flat = cv2.undistortImagePoints(points, self.matrix(), coefficients)
+        flat = cv2.undistortImagePoints(points, self.matrix(), coefficients, None, criteria)
         return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
