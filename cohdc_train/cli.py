@@ -3,7 +3,7 @@
 import importlib
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 
@@ -72,12 +72,26 @@ def _call(name: str, args: list[str]) -> None:
         if name in ("fit", "validate"):  # Lightning's own command line, which reads the arguments itself
             component(args)
             return
-        from jsonargparse import auto_cli
-
-        auto_cli(component, args=args, prog=f"cohdc {name}", as_positional=True)
+        _run_function(component, args, f"cohdc {name}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
             raise
         message = f"{name} needs {package}, which is not installed: pip install 'cohdc-train[train]'"
         raise MissingExtraError(message) from error
+
+
+def _run_function(component: Any, args: list[str], prog: str) -> None:
+    """Run a typed function, or the group of them in a dict, with a command line read from its signature."""
+    from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
+
+    class Parser(ArgumentParser):
+        """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`."""
+
+        def add_argument(self, *names: Any, **kwargs: Any) -> Any:
+            if kwargs.get("type") is bool and names[0].startswith("--"):
+                del kwargs["type"]
+                kwargs |= {"action": ActionYesNo, "nargs": "?"}
+            return super().add_argument(*names, **kwargs)
+
+    auto_cli(component, args=args, prog=prog, as_positional=True, parser_class=Parser)
