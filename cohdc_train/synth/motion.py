@@ -70,52 +70,55 @@ class Walk:
     pace: Doubles
 
 
-def walk(
-    rng: np.random.Generator, times: Doubles, distances: tuple[float, float], usual: float, reach: float, start: float
-) -> Walk:
-    """A person who crosses the view again and again, slowly, now and then stopping.
+def crowd(rng: np.random.Generator, times: Doubles, distances: Doubles, reach: float) -> tuple[Walk, ...]:
+    """People who cross the view side by side, again and again, slowly, mostly in one direction, often stopping midway.
 
-    times: [n] s, even steps; distances: nearest and farthest way in front of the eye, m; usual: +1 or -1, the direction
-    of five crossings in six (a crowd that moves one way is what misleads a camera); reach: how far beyond the border of
-    the view a crossing begins and ends, m; start: the part 0..1 of the first crossing that is over at the beginning.
-    Between two crossings the person is out of sight.
+    times: [n] s, even steps; distances: [p] m, how far in front of the eye each one walks; reach: how far beyond the
+    border of the view a crossing begins and ends, m. Between two crossings nobody is in sight. A group that moves as
+    one and covers half the view is what misleads a camera that trusts the majority.
     """
     step = float(times[1] - times[0])
+    sides = 0.3 * distances * rng.permutation(np.linspace(-1, 1, len(distances)) if len(distances) > 1 else np.zeros(1))
+    half = float(np.max(0.62 * distances + np.abs(sides))) + reach
+    usual = float(rng.choice([-1.0, 1.0]))
     pieces: list[Doubles] = []
-    headings: list[Doubles] = []
-    missing = len(times)
-    while missing > 0:
+    while sum(len(piece) for piece in pieces) < len(times):
         direction = usual if rng.random() < 5 / 6 else -usual
-        path = _crossing(rng, step, direction, distances, reach)
-        if not pieces:
-            path = path[int(len(path) * start) :]
-        velocity = np.gradient(path, axis=0)
-        moving = np.abs(velocity[:, 0]) > 1e-4
-        angle = np.where(moving, np.arctan2(velocity[:, 1], velocity[:, 0]), 0.0 if direction > 0 else np.pi)
-        pieces.append(path[:missing])
-        headings.append(angle[:missing])
-        missing -= len(path)
-    offsets = np.concatenate(pieces)
-    steps = np.linalg.norm(np.diff(offsets, axis=0, prepend=offsets[:1]), axis=1)
-    steps[steps > 1.2 * step] = 0.0  # from the end of a crossing to the start of the next, out of sight
-    pace = np.clip(steps / step / 0.5, 0, 1.15)
-    return Walk(offsets, np.concatenate(headings), np.cumsum(steps), pace)
+        path = direction * _crossing(rng, step, half)
+        pieces.append(path if pieces else path[int(len(path) * rng.uniform(0.3, 0.4)) :])
+    jumps = np.cumsum([len(piece) for piece in pieces])
+    line = np.concatenate(pieces)[: len(times)]
+    return tuple(
+        _walk(rng, times, line, (float(d), float(side)), jumps[jumps < len(times)])
+        for d, side in zip(distances, sides, strict=True)
+    )
 
 
-def _crossing(
-    rng: np.random.Generator, step: float, direction: float, distances: tuple[float, float], reach: float
-) -> Doubles:
-    """[k, 2] offsets from the eye on one way through the view, at even time steps."""
-    start, end = rng.uniform(*distances, 2)
-    half = 0.62 * max(start, end) + reach
-    pace = rng.uniform(0.45, 0.85)
-    stop = rng.uniform(-0.4, 0.4) * min(start, end)
-    pause = rng.uniform(0.8, 1.6) if rng.random() < 0.4 else 0.0
+def _walk(
+    rng: np.random.Generator, times: Doubles, line: Doubles, place: tuple[float, float], jumps: NDArray[np.int64]
+) -> Walk:
+    """One of a crowd: `line` [n] m is the way of its middle, `place` (distance, side) m this person's place in it."""
+    step = float(times[1] - times[0])
+    x = line + place[1] + _sway(rng, times, 0.06, 4.0)
+    y = place[0] + _sway(rng, times, 0.08, 6.0)
+    velocity = np.stack([np.diff(x, prepend=x[0]), np.diff(y, prepend=y[0])], 1)
+    velocity[jumps] = velocity[jumps - 1]
+    velocity[0] = velocity[min(1, len(x) - 1)]
+    speed = np.linalg.norm(velocity, axis=1)
+    pace = np.clip(speed / step / 0.4, 0, 1.15)
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    gone = rng.uniform(0, 1.4) + np.cumsum(speed)
+    return Walk(np.stack([x, y], 1), heading, gone, pace)
+
+
+def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
+    """[k] m from -half to half at even time steps, in two cases of three with a stop near the middle."""
+    pace = rng.uniform(0.5, 0.8)
+    stop = rng.uniform(-0.25, 0.25)
+    pause = rng.uniform(0.7, 1.4) if rng.random() < 2 / 3 else 0.0
     first, last = (stop + half) / pace, (half - stop) / pace
     duration = first + pause + last
-    t = np.arange(0, duration, step)
-    x = np.interp(t, [0, first, first + pause, duration], [-half, stop, stop, half])
+    x = np.interp(np.arange(0, duration, step), [0, first, first + pause, duration], [-half, stop, stop, half])
     window = max(round(0.35 / step), 1) | 1
-    x = np.convolve(np.pad(x, window // 2, mode="edge"), np.ones(window) / window, mode="valid")
-    y = start + (end - start) * (x + half) / (2 * half)
-    return np.stack([direction * x, y], 1)
+    smooth: Doubles = np.convolve(np.pad(x, window // 2, mode="edge"), np.ones(window) / window, mode="valid")
+    return smooth

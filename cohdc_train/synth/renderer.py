@@ -133,13 +133,6 @@ def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
     return Hits(found["primID"], weights, found["tfar"], directions)
 
 
-def instances(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> NDArray[np.int32]:
-    """[H, W] instance numbers only, 0 where nothing is met: a quick look without colours."""
-    triangle = cast(mesh, camera, T_wc).triangle
-    found = np.where(triangle >= 0, mesh.instance[np.maximum(triangle, 0)], 0)
-    return found.reshape(camera.height, camera.width).astype(np.int32)
-
-
 def render(mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: NDArray[np.float64]) -> View:
     """Colour, depth and instances of `mesh` seen by `camera` at `T_wc` [4, 4] (camera to world, m)."""
     hits = cast(mesh, camera, T_wc)

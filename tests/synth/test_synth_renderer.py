@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cohdc_train.synth import mesh as solids
-from cohdc_train.synth.renderer import Atlas, Camera, cast, instances, rays, render
+from cohdc_train.synth.renderer import Atlas, Camera, cast, rays, render
 from cohdc_train.synth.scene import Lighting
 
 pytest.importorskip("embreex")
@@ -47,7 +47,7 @@ def test_depth_of_a_plane(
 def test_ball_covers_its_circle_and_owns_its_pixels() -> None:
     ball = solids.ellipsoid((0, 0, 3), (0.5, 0.5, 0.5), 0).named(7, 0)
     camera = Camera(200, 200, 99.5, 99.5, 200, 200)
-    found = instances(ball, camera, looking_at_z())
+    found = render(ball, Atlas([GREY] * 8), LIGHT, camera, looking_at_z()).instance
     assert set(np.unique(found)) == {0, 7}
     radius = 200 * 0.5 / np.sqrt(3**2 - 0.5**2)
     assert 0.9 < (found == 7).sum() / (np.pi * radius**2) < 1.0, "the mesh is inscribed in the sphere"
