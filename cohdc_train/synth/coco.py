@@ -19,10 +19,10 @@ from cohdc_train.synth.scene import Lighting, Room, furnished_room, texture_deta
 from cohdc_train.synth.sensor import exposure, photograph, smear
 from cohdc_train.synth.streams import stream
 
-IMAGES_PER_ROOM = 4
+IMAGES_PER_ROOM = 5
 PEOPLE_PER_ROOM = 5
 SMALLEST_SHARE = 1 / 1500  # of the image's pixels; a smaller visible part of a person is not annotated
-SUPERSAMPLING = 2
+SUPERSAMPLING = 1.5
 _COUNT_CHANCE = (0.08, 0.22, 0.26, 0.22, 0.14, 0.08)  # of 0, 1, .. 5 people
 
 

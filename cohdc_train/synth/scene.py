@@ -138,7 +138,8 @@ class _Builder:
     def thing(self, place: tuple[float, float, float], size: NDArray[np.float64]) -> Mesh:
         """A small box or can."""
         if self.rng.random() < 0.6:
-            return solids.box(place, size, self.rng.uniform(0, 3), self.face(), self.face())
+            look = self.face()
+            return solids.box(place, size, self.rng.uniform(0, 3), look, look)
         return self.cylinder(place, size[0] / 2, size[2])
 
     def cylinder(self, centre: tuple[float, float, float], radius: float, height: float) -> Mesh:

@@ -203,10 +203,13 @@ def letters(image: Floats, rng: np.random.Generator, lines: int) -> None:
 
 def write(image: Floats, text: str, place: tuple[int, int], scale: float, ink: Floats) -> None:
     """Lay one line of text over a float [h, w, 3] image, in place (OpenCV writes on uint8 only)."""
-    stencil = np.zeros(image.shape[:2], dtype=np.uint8)
-    cv2.putText(stencil, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (255,), max(int(2.2 * scale), 1), cv2.LINE_AA)
+    top, bottom = max(place[1] - int(40 * scale) - 2, 0), place[1] + int(16 * scale) + 2
+    rows = image[top:bottom]
+    stencil = np.zeros(rows.shape[:2], dtype=np.uint8)
+    place, thick = (place[0], place[1] - top), max(int(2.2 * scale), 1)
+    cv2.putText(stencil, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (255,), thick, cv2.LINE_AA)
     cover = stencil[..., None].astype(np.float32) / 255
-    image[:] = image * (1 - cover) + ink * cover
+    rows[:] = rows * (1 - cover) + ink * cover
 
 
 WALLS = (plaster, brick, tiles, wallpaper, wood)

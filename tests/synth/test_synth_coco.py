@@ -63,7 +63,7 @@ def test_annotations_are_the_rendered_masks(folder: Path) -> None:
     stage = draw_stage(rng, texture_detail(SIZE))
     api = pycocotools.COCO(folder / "instances_train.json")
     seen = 0
-    for image_id in (1, 2, 3, 4):
+    for image_id in (1, 2, 3, 4, 5):
         picture: Picture = take_picture(stage, rng, SIZE)
         annotations = api.loadAnns(sorted(api.getAnnIds(image_id)))
         assert len(annotations) == len(picture.masks)
