@@ -29,9 +29,9 @@ def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Floa
 def finish(image: Floats, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0) -> Texture:
     """Dirt and grain over a drawn surface: float [h, w, 3] in 0..255 -> uint8."""
     height, width = image.shape[:2]
-    dirt = noise(rng, height, width)[..., None] * stains
-    speck = rng.normal(0, grain, (height, width, 1)).astype(np.float32)
-    return np.clip(image + dirt + speck, 0, 255).astype(np.uint8)
+    dirt = cv2.resize(noise(rng, height // 2, width // 2), (width, height)) * np.float32(stains)
+    dirt += rng.standard_normal((height, width), dtype=np.float32) * np.float32(grain)
+    return np.clip(image + dirt[..., None], 0, 255).astype(np.uint8)
 
 
 def flat(height: int, width: int, rgb: Floats) -> Floats:
