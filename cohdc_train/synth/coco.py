@@ -109,7 +109,7 @@ def _relit(lighting: Lighting, rng: np.random.Generator) -> Lighting:
 
 def _developed(rgb: Floats, rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
     """The supersampled rendering as a photograph of `size`: exposure, motion blur in a third, optics, noise."""
-    rgb = np.minimum(rgb * np.float32(exposure(rgb, 0.42 * float(np.exp(rng.normal(0, 0.25))))), 1)
+    rgb = np.minimum(rgb * np.float32(exposure(rgb, 0.4 * float(np.exp(rng.normal(0, 0.25))))), 1)
     scale = size[1] / 256
     if rng.random() < 0.33:
         rgb = smear(rgb, SUPERSAMPLING * scale * float(rng.uniform(1.5, 6)), float(rng.uniform(0, np.pi)))

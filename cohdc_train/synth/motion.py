@@ -71,7 +71,7 @@ class Walk:
 
 
 def crowd(rng: np.random.Generator, times: Doubles, distances: Doubles, reach: float) -> tuple[Walk, ...]:
-    """People who cross the view side by side, again and again, slowly, mostly in one direction, often stopping midway.
+    """People who cross the view side by side, again and again, slowly, mostly in one direction, stopping midway.
 
     times: [n] s, even steps; distances: [p] m, how far in front of the eye each one walks; reach: how far beyond the
     border of the view a crossing begins and ends, m. Between two crossings nobody is in sight. A group that moves as
@@ -112,10 +112,10 @@ def _walk(
 
 
 def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
-    """[k] m from -half to half at even time steps, in two cases of three with a stop near the middle."""
-    pace = rng.uniform(0.5, 0.8)
+    """[k] m from -half to half at even time steps, with a stop near the middle."""
+    pace = rng.uniform(0.5, 0.75)
     stop = rng.uniform(-0.25, 0.25)
-    pause = rng.uniform(0.7, 1.4) if rng.random() < 2 / 3 else 0.0
+    pause = rng.uniform(0.7, 1.5)
     first, last = (stop + half) / pace, (half - stop) / pace
     duration = first + pause + last
     x = np.interp(np.arange(0, duration, step), [0, first, first + pause, duration], [-half, stop, stop, half])

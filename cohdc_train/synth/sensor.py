@@ -13,7 +13,7 @@ RGB_SIGMA = 2.5  # grey levels
 EDGE_DROPOUT = 0.6
 
 
-def exposure(rgb: Floats, brightness: float = 0.42) -> float:
+def exposure(rgb: Floats, brightness: float = 0.37) -> float:
     """The factor that brings a rendered image to the mean `brightness` (1 = white), as a camera's automatic would."""
     return brightness / max(float(np.minimum(rgb, 1.5 * rgb.mean()).mean()), 1e-3)
 

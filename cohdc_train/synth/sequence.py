@@ -24,8 +24,9 @@ FIRST_STAMP = 1305031102.175304  # s
 TRUTH_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own stamp
 SHARE = (0.28, 0.38)  # mean share of person pixels a scene is drawn for
 PEAK = 0.6  # share of person pixels no frame should exceed
-_DRAWS = 16  # how often the ways are drawn anew to get there
-_REACH = {"xyz": 0.85, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2}  # m beyond the view's border where people turn
+EMPTY = 0.2  # share of the frames that may show next to nobody
+_DRAWS = 24  # how often the ways are drawn anew to get there
+_REACH = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2}  # m beyond the view's border where people turn
 _EYE_Y = 0.9  # m from the wall behind the camera
 
 
@@ -72,13 +73,12 @@ class Scene:
 def draw_scene(seed: int, frames: int, size: tuple[int, int], motion: CameraMotion, people: int) -> Scene:
     """Draw the room, the camera's path and the people's ways, so that people cover 20-40 % of the pixels on average.
 
-    size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of them fits SHARE and
-    PEAK; the best is taken.
+    size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of them fits SHARE,
+    PEAK and EMPTY; the best is taken.
     """
-    rng = stream(seed, "sequence")
-    room = furnished_room(
-        rng, (7.5, float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8))), 3.4, texture_detail(size)
-    )
+    rng = stream(seed, "sequence", 1)  # apart from the room's, whose draws depend on the size of its textures
+    room_size = (7.5, float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8)))
+    room = furnished_room(stream(seed, "sequence"), room_size, 3.4, texture_detail(size))
     fine = np.arange(TRUTH_PER_FRAME * (frames - 1) + 1) / (RATE * TRUTH_PER_FRAME)
     eye = np.array([0.0, _EYE_Y, rng.uniform(1.25, 1.5)])
     truth = camera_path(rng, fine, motion, eye)
@@ -91,13 +91,14 @@ def draw_scene(seed: int, frames: int, size: tuple[int, int], motion: CameraMoti
         walks = crowd(rng, fine[::TRUTH_PER_FRAME], distances, _REACH[motion]) if people else ()
         scene = Scene(room, cast, walks, Camera.freiburg3(size), truth)
         shares = _coarse_shares(scene, figures)
-        mean, peak = float(shares.mean()), float(shares.max())
-        cost = max(SHARE[0] - mean, mean - SHARE[1], 0.0) + 0.5 * max(peak - PEAK, 0.0)
+        mean, peak, empty = float(shares.mean()), float(shares.max()), float(np.mean(shares < 0.05))
+        cost = max(SHARE[0] - mean, mean - SHARE[1], 0.0) + 0.5 * max(peak - PEAK, 0.0) + 0.5 * max(empty - EMPTY, 0.0)
         if best is None or cost < best[0]:
             best = (cost, scene)
         if cost == 0:
             break
-        nearest = float(np.clip(nearest * np.sqrt(max(mean, 0.02) / np.mean(SHARE)), 0.9, 1.7))
+        nearer = np.sqrt(max(mean, 0.02) / np.mean(SHARE)) if peak <= PEAK else 1.05
+        nearest = float(np.clip(nearest * nearer, 0.8 + 0.1 * people, 1.6))
     assert best is not None
     return best[1]
 

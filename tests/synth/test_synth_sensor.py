@@ -64,4 +64,4 @@ def test_smear_runs_along_its_angle_and_keeps_the_light() -> None:
 def test_exposure_brings_any_light_to_one_brightness() -> None:
     rgb = np.random.default_rng(0).uniform(0.1, 0.3, (40, 50, 3)).astype(np.float32)
     for light in (0.2, 1.0, 7.0):
-        assert (rgb * light * exposure(rgb * light)).mean() == pytest.approx(0.42, rel=0.05)
+        assert (rgb * light * exposure(rgb * light)).mean() == pytest.approx(0.37, rel=0.05)
