@@ -22,8 +22,9 @@ from cohdc_train.synth.streams import stream
 RATE = 30.0  # frames per second
 FIRST_STAMP = 1305031102.175304  # s
 TRUTH_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own stamp
-SHARE = (0.28, 0.38)  # mean share of person pixels a scene is drawn for
-PEAK = 0.6  # share of person pixels no frame should exceed
+SHARE = (0.26, 0.38)  # mean share of person pixels a scene is drawn for
+PEAK = 0.62  # share of person pixels no frame should exceed
+_COARSE_BIAS = 0.87  # exact over coarse share: pixels touched by a point count as whole ones
 EMPTY = 0.2  # share of the frames that may show next to nobody
 _DRAWS = 24  # how often the ways are drawn anew to get there
 _REACH = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2}  # m beyond the view's border where people turn
@@ -121,7 +122,7 @@ def _coarse_shares(scene: Scene, figures: list[Mesh]) -> Doubles:
             inside = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
             seen[v[inside], u[inside]] = 1
         shares.append(cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)).mean())
-    return np.array(shares)
+    return _COARSE_BIAS * np.array(shares)
 
 
 def sequence(
