@@ -38,7 +38,7 @@ class NetworkConfig:
         width: channels of the backbone as a share of ResNet's.
         rates: dilation patterns of the four stages.
         weights: torchvision name or local path of ImageNet weights for the backbone; None trains from scratch.
-        norm: "batch" trains BatchNorm, "frozen" keeps the weights' statistics.
+        norm: "batch" trains BatchNorm, in the pyramid too; "frozen" keeps the weights' statistics.
         frozen_stages: how many of stem, layer1 .. layer4 are not trained.
         canvas: (height, width) in px every image is fitted into.
         anchor_scales: side of the anchors in px, one per pyramid level from stride 4; a fifth adds the pool level.
@@ -99,7 +99,8 @@ class Backbone(nn.Module):
         if config.weights is not None:
             load_backbone_weights(self.body, config.depth, config.weights)
         pool = LastLevelMaxPool() if len(config.anchor_scales) == 5 else None
-        self.fpn = FeaturePyramidNetwork(self.body.out_channels, config.fpn_channels, pool)
+        norm = nn.BatchNorm2d if config.norm == "batch" else None
+        self.fpn = FeaturePyramidNetwork(self.body.out_channels, config.fpn_channels, pool, norm)
 
     def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
         """x: [B, 3, H, W] normalised. Returns the pyramid, "0" at stride 4 to "3" at 32, perhaps "pool" at 64."""
