@@ -28,8 +28,8 @@ class Plan:
     epochs: int
 
 
-FULL = Plan(train_images=500, val_images=60, frames=240, epochs=10)
-QUICK = Plan(train_images=160, val_images=24, frames=120, epochs=6)
+FULL = Plan(train_images=500, val_images=60, frames=240, epochs=16)
+QUICK = Plan(train_images=160, val_images=24, frames=120, epochs=8)
 
 
 @dataclass
