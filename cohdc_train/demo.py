@@ -1,8 +1,6 @@
 """The whole way on a rendered room: data, training, ONNX, SLAM without and with it, scores, report."""
 
-import json
 import multiprocessing
-import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cohdc_train.errors import CohdcError
+from cohdc_train.files import write_json
 
 _MARK = "demo.json"  # written first, so that a later run knows the folder as its own
 _OVERLAYS = 6
@@ -87,7 +86,7 @@ def demo(out: Path = Path("runs/demo"), quick: bool = False, seed: int = 0) -> d
         "plan": vars(plan),
         "seed": seed,
     }
-    _write_json(out / "summary.json", summary)
+    write_json(out / "summary.json", summary)
     print(table(summary, out))
     return summary
 
@@ -116,7 +115,7 @@ def _claim(out: Path, plan: Plan, seed: int) -> None:
             raise CohdcError(f"{out}: not empty and not from a former demo; give another --out")
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
-    _write_json(out / _MARK, {"plan": vars(plan), "seed": seed})
+    write_json(out / _MARK, {"plan": vars(plan), "seed": seed})
 
 
 def _render(out: Path, plan: Plan, seed: int) -> None:
@@ -185,9 +184,3 @@ def _report(out: Path, scores: dict[str, float], clock: Clock) -> None:
         sorted((out / "predictions").glob("*_overlay.jpg")),
         tables,
     )
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(temporary, path)

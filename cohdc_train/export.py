@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cohdc_train import __version__, signature
 from cohdc_train.errors import CohdcError, ExportError
+from cohdc_train.files import write_json
 
 if TYPE_CHECKING:
     from cohdc_train.models import MaskRCNN
@@ -70,7 +71,7 @@ def export(checkpoint: Path, out: Path | None = None, images: Path | None = None
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
-    _write_json(target.with_name(target.name + ".json"), report)
+    write_json(target.with_name(target.name + ".json"), report)
     worst = ", ".join(f"{name} {report['max_difference'][name]:.1e}" for name in TOLERANCES)
     print(
         f"{target}: {report['bytes'] / 1e6:.1f} MB, {nodes} nodes, opset {OPSET}; equals torch on "
@@ -230,9 +231,3 @@ def _drawn_images() -> list[NDArray[np.uint8]]:
             cv2.ellipse(picture, centre, axes, float(rng.uniform(-30, 30)), 0, 360, colour, -1)
         pictures.append(cv2.GaussianBlur(picture, (3, 3), 0).astype(np.uint8))
     return pictures
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(temporary, path)

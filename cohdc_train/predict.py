@@ -1,7 +1,6 @@
 """`cohdc predict`: images, a folder of them or a video through an ONNX -> overlays and one COCO file (no torch)."""
 
 import json
-import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.contour import Polygon, simplify, trace
 from cohdc_train.errors import DataError
+from cohdc_train.files import write_bytes, write_text
 from cohdc_train.segmenter import Detections, Segmenter
 
 Image = NDArray[np.uint8]
@@ -102,9 +102,9 @@ def predict_pictures(
         for row, outline in enumerate(outlines):
             entry = {"id": len(annotations) + 1, "image_id": image_id, "file_name": picture.name}
             annotations.append(entry | _annotation(found, row, outline))
-        _write(out / picture.overlay, _jpeg(draw(picture.rgb, found, outlines)))
+        write_bytes(out / picture.overlay, _jpeg(draw(picture.rgb, found, outlines)))
     result = {"images": images, "categories": categories, "annotations": annotations}
-    _write(out / "predictions.json", json.dumps(result).encode())
+    write_text(out / "predictions.json", json.dumps(result))
     return result
 
 
@@ -206,9 +206,3 @@ def _write_text(canvas: Image, text: str, box: NDArray[np.float32], colour: tupl
 
 def _jpeg(rgb: Image) -> bytes:
     return bytes(cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])[1])
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)

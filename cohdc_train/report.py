@@ -4,7 +4,6 @@ import base64
 import html
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
+from cohdc_train.files import write_text
 from cohdc_train.trajectory import Trajectory, align_umeyama, match, read_tum
 
 if TYPE_CHECKING:
@@ -107,11 +107,7 @@ def _write(out: Path, title: str, parts: Sequence[str]) -> None:
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
     body = "\n".join([f"<h1>{html.escape(title)}</h1>", *parts])
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(out.name + ".part")
-    temporary.write_text(
-        f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n', "utf-8"
-    )
-    os.replace(temporary, out)
+    write_text(out, f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n')
 
 
 def _load(label: str, folder: Path, truth: Trajectory) -> _Run:

@@ -4,9 +4,7 @@ A trajectory file of the TUM RGB-D benchmark has one pose per line: `stamp tx ty
 unit quaternion, camera to world. Lines that begin with # are comments.
 """
 
-import json
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
+from cohdc_train.files import write_json, write_text
 
 FloatArray = NDArray[np.float64]
 Scores = dict[str, dict[str, float]]
@@ -122,13 +121,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     for stamp, values in zip(trajectory.stamps, np.hstack([trajectory.positions, quaternions]), strict=True):
         time = np.format_float_positional(stamp, trim="0", min_digits=6)
         rows.append(" ".join([time, *(f"{value:.10f}" for value in values)]))
-    _write_text(path, "\n".join(rows) + "\n")
-
-
-def _write_text(path: Path, text: str) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, "\n".join(rows) + "\n")
 
 
 def associate(a: FloatArray, b: FloatArray, max_difference: float = 0.02) -> NDArray[np.int64]:
@@ -295,5 +288,5 @@ def evaluate(
     print(f"pairs {pairs} of {len(guess)} estimated poses, coverage {100 * coverage(truth, guess):.1f} %")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        _write_text(out, json.dumps(result, indent=2) + "\n")
+        write_json(out, result)
     return result

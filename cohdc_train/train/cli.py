@@ -1,7 +1,5 @@
 """`cohdc fit` (Lightning's command line) and `cohdc validate`."""
 
-import json
-import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +15,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
+from cohdc_train.files import write_json
 from cohdc_train.presets import config_path
 from cohdc_train.train.module import MaskRCNNModule
 
@@ -94,7 +93,8 @@ def score(
     for name, value in results.items():
         print(f"{name:<14}{value:.4f}")
     if out is not None:
-        _write_json(out, results)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, results)
     return results
 
 
@@ -182,10 +182,3 @@ def _told_in_one_line() -> Iterator[None]:
             raise CohdcError(lines[-1].partition("Error: ")[2] if len(lines) > 1 else str(error)) from error
         except (MisconfigurationException, FileNotFoundError) as error:
             raise CohdcError(" ".join(str(error).split())) from error
-
-
-def _write_json(path: Path, content: dict[str, float]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(path.suffix + ".part")
-    temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
