@@ -23,7 +23,9 @@ _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".webp"}
 _PARITY_IMAGES = 4
 
 
-def export(checkpoint: Path, out: Path | None = None, images: Path | None = None) -> Path:
+def export(
+    checkpoint: Path, out: Path | None = None, images: Path | None = None, canvas: tuple[int, int] | None = None
+) -> Path:
     """Write a checkpoint as an ONNX file that keeps the contract, proven equal to the torch network.
 
     The proof runs two image sizes, batches of one and two, and a black image. Beside the file lies `<file>.json` with
@@ -33,6 +35,8 @@ def export(checkpoint: Path, out: Path | None = None, images: Path | None = None
         checkpoint: a `.ckpt` of `cohdc fit`.
         out: the file to write; `model.onnx` beside the checkpoint when left out.
         images: folder of pictures to compare on, best with objects on them; drawn shapes when left out.
+        canvas: height and width in px that the file fits images into; the training's when left out. A larger one finds
+            smaller objects and takes longer.
 
     Returns:
         The path of the file.
@@ -46,7 +50,7 @@ def export(checkpoint: Path, out: Path | None = None, images: Path | None = None
     from cohdc_train.train.module import MaskRCNNModule
 
     started = time.monotonic()
-    module = MaskRCNNModule.load(Path(checkpoint))
+    module = MaskRCNNModule.load(Path(checkpoint), canvas)
     target = Path(out) if out is not None else Path(checkpoint).parent / "model.onnx"
     pictures = _read_images(Path(images)) if images is not None else _drawn_images()
     network = module.network.float().cpu().eval()

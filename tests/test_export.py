@@ -70,6 +70,16 @@ def test_the_segmenter_sees_what_the_network_sees_at_a_third_size(exported, opin
     assert found.masks().shape == (len(found), 111, 222)
 
 
+def test_another_canvas_than_the_trainings(checkpoint, opinionated, tmp_path):
+    rows, columns = opinionated.config.canvas
+    larger = (rows + 64, columns + 32)
+    file = export(checkpoint, tmp_path / "larger.onnx", canvas=larger)
+    assert Segmenter(file).canvas == larger
+    with pytest.raises(CohdcError, match="canvas 8 x 64 px"):
+        export(checkpoint, tmp_path / "tiny.onnx", canvas=(8, 64))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["larger.onnx", "larger.onnx.json"]
+
+
 def test_a_file_that_differs_is_not_left_behind(checkpoint, exported, tmp_path, monkeypatch):
     """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the folder."""
 

@@ -36,16 +36,16 @@ def outlines(mask: Mask) -> list[list[float]] | None:
     return polygons
 
 
-def annotate(mask: Mask, image_id: int, annotation_id: int) -> dict[str, Any]:
-    """The COCO annotation of one visible person. mask: [H, W], not empty."""
+def annotate(mask: Mask, image_id: int, annotation_id: int, crowd: bool = False) -> dict[str, Any]:
+    """The COCO annotation of one visible person. mask: [H, W], not empty; a crowd is ignored by losses and scores."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     left, top = int(columns[0]), int(rows[0])
-    polygons = outlines(mask)
+    polygons = None if crowd else outlines(mask)
     return {
         "id": annotation_id,
         "image_id": image_id,
         "category_id": 1,
-        "iscrowd": 0,
+        "iscrowd": int(crowd),
         "area": int(mask.sum()),
         "bbox": [left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1],
         "segmentation": run_lengths(mask) if polygons is None else polygons,

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 Texture = NDArray[np.uint8]  # [h, w, 3] RGB, h and w powers of two
 Floats = NDArray[np.float32]
+SATURATION = 0.35  # rooms are painted in calmer colours than people are dressed in
 
 
 def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) -> Floats:
@@ -27,8 +28,10 @@ def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Floa
 
 
 def finish(image: Floats, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0) -> Texture:
-    """Dirt and grain over a drawn surface: float [h, w, 3] in 0..255 -> uint8."""
+    """Dirt and grain over a drawn surface in muted colours: float [h, w, 3] in 0..255 -> uint8."""
     height, width = image.shape[:2]
+    grey = image.mean(axis=2, keepdims=True)
+    image = grey + np.float32(SATURATION) * (image - grey)
     dirt = cv2.resize(noise(rng, height // 2, width // 2), (width, height)) * np.float32(stains)
     dirt += rng.standard_normal((height, width), dtype=np.float32) * np.float32(grain)
     return np.clip(image + dirt[..., None], 0, 255).astype(np.uint8)

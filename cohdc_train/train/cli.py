@@ -70,6 +70,7 @@ def score(
     batch_size: int = 2,
     workers: int = 1,
     precision: str = "32-true",
+    canvas: tuple[int, int] | None = None,
 ) -> dict[str, float]:
     """Print a checkpoint's scores on the validation split of a COCO-format folder.
 
@@ -81,8 +82,9 @@ def score(
         batch_size: images per batch.
         workers: processes that read images.
         precision: Lightning's precision, such as bf16-mixed.
+        canvas: height and width in px to fit images into; the training's when not given.
     """
-    module = MaskRCNNModule.load(checkpoint)
+    module = MaskRCNNModule.load(checkpoint, canvas)
     module.rescore = module.rescore if rescore is None else rescore
     data = CocoDataModule(root, module.class_names, module.network_config.canvas, batch_size, workers)
     if data.class_names != module.class_names:
@@ -111,7 +113,6 @@ class FitCommand(LightningCLI):
                 "checkpoint.monitor": _BEST,
                 "checkpoint.mode": "max",
                 "checkpoint.filename": "best",
-                "checkpoint.save_last": True,
                 "checkpoint.enable_version_counter": False,
             }
         )
@@ -128,15 +129,16 @@ class FitCommand(LightningCLI):
             raise CohdcError(" ".join(str(error).split())) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """The trainer with CSV and TensorBoard logs below `--out` and a rich progress bar, unless told otherwise."""
+        """The trainer with CSV and TensorBoard logs, a progress bar and `last.ckpt`, unless told otherwise."""
         config = self.config["trainer"]
         if config["logger"] in (None, True):
             root = Path(self.config["out"])
             csv = CSVLogger(root, name="logs")
             kwargs["logger"] = [csv, TensorBoardLogger(root, name="logs", version=csv.version)]
-        if config["enable_progress_bar"] is not False:
-            given = self.config_init["trainer"]["callbacks"] or []
-            kwargs["callbacks"] = [RichProgressBar(leave=True), *(given if isinstance(given, list) else [given])]
+        given = self.config_init["trainer"]["callbacks"] or []
+        bar = [] if config["enable_progress_bar"] is False else [RichProgressBar(leave=True)]
+        last = _keep_last(Path(self.config["out"]))
+        kwargs["callbacks"] = [*bar, last, *(given if isinstance(given, list) else [given])]
         return super().instantiate_trainer(**kwargs)
 
     def run(self) -> None:
@@ -145,6 +147,11 @@ class FitCommand(LightningCLI):
         if checkpoint is not None and not checkpoint.is_file():
             raise CohdcError(f"{checkpoint}: no such file")
         self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=checkpoint)
+
+
+def _keep_last(folder: Path) -> ModelCheckpoint:
+    """`last.ckpt` after every epoch. ModelCheckpoint's own `save_last` writes it only when the best one changes."""
+    return ModelCheckpoint(folder, "last", save_top_k=1, save_on_train_epoch_end=True, enable_version_counter=False)
 
 
 class _SaveConfig(SaveConfigCallback):

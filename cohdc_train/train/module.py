@@ -51,6 +51,7 @@ class OptimizerConfig:
         return self.final_fraction + (1 - self.final_fraction) * 0.5 * (1 + math.cos(math.pi * done))
 
 
+MIN_CANVAS = 32  # px: one cell of the coarsest level that RoIs are pooled from
 _NETWORK = NetworkConfig()
 _OPTIMIZER = OptimizerConfig()
 
@@ -90,15 +91,19 @@ class MaskRCNNModule(pl.LightningModule):
         self._metrics: SegmentationMetrics | None = None
 
     @classmethod
-    def load(cls, path: Path) -> "MaskRCNNModule":
+    def load(cls, path: Path, canvas: tuple[int, int] | None = None) -> "MaskRCNNModule":
         """A trained module in evaluation mode on the CPU, without fetching the weights its training started from.
 
-        Raises CohdcError naming the file when it is no checkpoint of this class.
+        canvas: (height, width) px to fit images into instead of the training's. Raises CohdcError naming the file when
+        it is no checkpoint of this class.
         """
+        if canvas is not None and min(canvas) < MIN_CANVAS:
+            raise CohdcError(f"canvas {canvas[0]} x {canvas[1]} px: height and width are at least {MIN_CANVAS}")
         try:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
             values, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
-            network = NetworkConfig(**{**values["network"], "weights": None})
+            changed = {"weights": None} | ({} if canvas is None else {"canvas": canvas})
+            network = NetworkConfig(**{**values["network"], **changed})
             module = cls(values["class_names"], network, OptimizerConfig(**values["optimizer"]), values["rescore"])
             module.load_state_dict(state)
         except FileNotFoundError as error:
@@ -151,8 +156,8 @@ class MaskRCNNModule(pl.LightningModule):
         if config.name == "sgd":
             optimizer = torch.optim.SGD(groups, lr=config.lr, momentum=config.momentum)
         else:
-            # A tenth of the step on a CPU. Lightning cannot clip the gradients of a fused optimizer under an fp16 scaler.
-            optimizer = torch.optim.AdamW(groups, lr=config.lr, fused=self.trainer.precision != "16-mixed")
+            # Fused saves a tenth of a step on a CPU; in mixed precision Lightning cannot clip its gradients.
+            optimizer = torch.optim.AdamW(groups, lr=config.lr, fused=self.trainer.precision == "32-true")
         total = self.trainer.estimated_stepping_batches
         if math.isinf(total):
             raise CohdcError("the schedule needs an end: give trainer.max_epochs or trainer.max_steps")

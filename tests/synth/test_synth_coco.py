@@ -10,7 +10,8 @@ import pytest
 
 from cohdc_train.errors import DataError
 from cohdc_train.synth import coco
-from cohdc_train.synth.coco import Picture, draw_stage, take_picture
+from cohdc_train.synth.annotation import annotate
+from cohdc_train.synth.coco import SMALLEST_SHARE, Picture, draw_stage, take_picture
 from cohdc_train.synth.streams import stream
 
 pytest.importorskip("embreex")
@@ -50,10 +51,20 @@ def test_layout_and_loading(folder: Path, capsys: pytest.CaptureFixture[str]) ->
                 assert np.sum(masks, axis=0).max() == 1, "no pixel has two owners"
         for annotation in api.loadAnns(api.getAnnIds()):
             mask = api.annToMask(annotation)
-            assert mask.sum() == annotation["area"] >= SIZE[0] * SIZE[1] / 1500
-            assert annotation["iscrowd"] == 0
+            assert mask.sum() == annotation["area"] > 0
+            assert annotation["iscrowd"] == (mask.mean() < SMALLEST_SHARE)
         people += len(api.anns)
     assert people >= 10
+
+
+def test_crumbs_of_people_are_a_crowd_that_scores_ignore() -> None:
+    mask = np.zeros((40, 50), dtype=np.bool_)
+    mask[3:5, 4:8] = True
+    crumb = annotate(mask, 1, 1, crowd=True)
+    assert crumb["iscrowd"] == 1
+    assert crumb["area"] == 8
+    assert set(crumb["segmentation"]) == {"size", "counts"}, "COCO keeps crowds as run lengths"
+    assert isinstance(annotate(mask, 1, 2)["segmentation"], list)
 
 
 def test_annotations_are_the_rendered_masks(folder: Path) -> None:

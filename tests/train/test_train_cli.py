@@ -95,6 +95,13 @@ def test_what_is_no_checkpoint_is_told_in_one_line(tmp_path: Path, content: byte
     assert "\n" not in str(error.value)
 
 
+def test_the_last_checkpoint_is_of_the_last_epoch_even_when_an_earlier_one_is_best(toy: Path) -> None:
+    out = toy / "standstill"  # at this rate no epoch scores better than the first
+    fit(arguments(toy, out, "--trainer.max_epochs=3", "--model.optimizer.lr=1e-12"))
+    epochs = {name: torch.load(out / f"{name}.ckpt", weights_only=True)["epoch"] for name in ("best", "last")}
+    assert epochs == {"best": 0, "last": 2}
+
+
 @pytest.mark.filterwarnings("ignore:The dirpath has changed")  # a true warning, and here the intention
 def test_training_resumes_with_more_epochs(toy: Path, run: Path) -> None:
     trainer = fit(arguments(toy, toy / "resumed", "--trainer.max_epochs=2", f"--ckpt_path={run / 'last.ckpt'}"))

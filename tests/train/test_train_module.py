@@ -18,6 +18,8 @@ TINY = NetworkConfig(depth=18, width=0.125, fpn_channels=8, fc=16, canvas=(32, 3
 class Steps:
     """As much of a trainer as the optimizer asks for."""
 
+    precision = "32-true"
+
     def __init__(self, total: float) -> None:
         self.estimated_stepping_batches = total
 
