@@ -1,6 +1,7 @@
 """The whole way on a rendered room: data, training, ONNX, SLAM without and with it, scores, report."""
 
 import multiprocessing
+import os
 import shutil
 import subprocess
 import sys
@@ -121,16 +122,24 @@ def _claim(out: Path, plan: Plan, seed: int) -> None:
 
 
 def _render(out: Path, plan: Plan, seed: int) -> None:
-    """The set and the sequence, each in a process of its own: the renderer uses one core."""
+    """The set and the sequence, each in a process of its own on one core."""
     from cohdc_train.synth import coco, sequence
 
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), initializer=_use_one_thread) as pool:
         jobs = [
             pool.submit(coco, out / "data", train=plan.train_images, val=plan.val_images, seed=seed),
             pool.submit(sequence, out / "sequence", frames=plan.frames, seed=seed),
         ]
         for job in jobs:
             job.result()
+
+
+def _use_one_thread() -> None:
+    """For a new process, before numpy is loaded in it: threads of two renderers would wait for each other."""
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    import cv2
+
+    cv2.setNumThreads(1)
 
 
 def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:

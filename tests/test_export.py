@@ -1,5 +1,6 @@
 """A checkpoint becomes an ONNX file that equals it, or no file."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -78,6 +79,18 @@ def test_another_canvas_than_the_trainings(checkpoint, opinionated, tmp_path):
     with pytest.raises(CohdcError, match="canvas 8 x 64 px"):
         export(checkpoint, tmp_path / "tiny.onnx", canvas=(8, 64))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["larger.onnx", "larger.onnx.json"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cqe", ["multiply", "add", "off"])
+def test_every_form_of_the_quality_head_exports(cqe, opinionated, tmp_path):
+    module = MaskRCNNModule(["person", "car"], dataclasses.replace(opinionated.config, cqe=cqe))
+    rest = {name: value for name, value in opinionated.state_dict().items() if not name.startswith("cqe.")}
+    module.network.load_state_dict(rest, strict=False)
+    torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / f"{cqe}.ckpt")
+    report = json.loads(export(tmp_path / f"{cqe}.ckpt").with_name("model.onnx.json").read_text())
+    assert report["detections_compared"] > 20
+    assert report["max_difference"]["quality"] <= 1e-3
 
 
 def test_a_file_that_differs_is_not_left_behind(checkpoint, exported, tmp_path, monkeypatch):

@@ -3,16 +3,24 @@
 The paper feeds the true contour to the head; at inference there is none, so the truth enters through the target only.
 """
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F  # noqa: N812 torch's own name for it
 from torch import Tensor, nn
 from torchvision.ops import roi_align
 
+Fusion = Literal["concat", "multiply", "add"]
+
 
 class CQEHead(nn.Module):
-    """Four 3x3 convolutions (the last with stride 2) and three fully connected layers (paper 2.1.2).
+    """Four 3x3 convolutions and three fully connected layers (paper 2.1.2) over an RoI feature and a predicted mask.
 
-    The predicted mask is max-pooled to the RoI feature's size and concatenated to it.
+    How the two meet:
+    - "concat": the mask, max-pooled to the feature's size, is one more channel (Mask Scoring R-CNN);
+    - "multiply": the feature is multiplied by the max-pooled mask (paper, Fig. 5, first structure);
+    - "add": the mask, not pooled, is added to the feature enlarged to the mask's size (Fig. 5, second structure; the
+      paper's larger RoI feature is the same one, interpolated), and the first convolution halves it again.
 
     Args:
         in_channels: channels of the RoI feature.
@@ -20,12 +28,22 @@ class CQEHead(nn.Module):
         channels: width of the convolutions (paper: 256).
         fc: width of the first two fully connected layers (paper: 1024).
         roi_size: side of the RoI feature, cells.
+        fusion: see above.
     """
 
-    def __init__(self, in_channels: int, num_classes: int, channels: int = 256, fc: int = 1024, roi_size: int = 14):
+    def __init__(
+        self,
+        in_channels: int,
+        num_classes: int,
+        channels: int = 256,
+        fc: int = 1024,
+        roi_size: int = 14,
+        fusion: Fusion = "concat",
+    ) -> None:
         super().__init__()
-        widths = [in_channels + 1, channels, channels, channels, channels]
-        strides = [1, 1, 1, 2]
+        self.fusion = fusion
+        widths = [in_channels + (fusion == "concat"), channels, channels, channels, channels]
+        strides = [2 if fusion == "add" else 1, 1, 1, 2]
         layers: list[nn.Module] = []
         for i in range(4):
             layers += [nn.Conv2d(widths[i], widths[i + 1], 3, stride=strides[i], padding=1), nn.ReLU(inplace=True)]
@@ -42,10 +60,16 @@ class CQEHead(nn.Module):
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
         """features: [K, C, 14, 14]; masks: [K, 28, 28] probabilities of one class. Returns [K, num_classes], linear."""
-        pooled = F.max_pool2d(masks[:, None], kernel_size=masks.shape[-1] // features.shape[-1])
-        x = self.convs(torch.cat([features, pooled], dim=1))
-        quality: Tensor = self.quality(self.fcs(x.flatten(1)))
+        quality: Tensor = self.quality(self.fcs(self.convs(self.fuse(features, masks)).flatten(1)))
         return quality
+
+    def fuse(self, features: Tensor, masks: Tensor) -> Tensor:
+        """What the convolutions see: [K, C + 1, 14, 14], [K, C, 14, 14] or [K, C, 28, 28], as `fusion` says."""
+        scale = masks.shape[-1] // features.shape[-1]
+        if self.fusion == "add":
+            return F.interpolate(features, scale_factor=float(scale), mode="bilinear") + masks[:, None]
+        pooled = F.max_pool2d(masks[:, None], kernel_size=scale)
+        return features * pooled if self.fusion == "multiply" else torch.cat([features, pooled], dim=1)
 
 
 @torch.no_grad()

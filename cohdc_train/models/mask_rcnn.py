@@ -20,7 +20,7 @@ from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
 from cohdc_train.models.backbones import Depth, HDCResNet, load_backbone_weights
-from cohdc_train.models.cqe import CQEHead, cqe_loss, cqe_targets
+from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss, cqe_targets
 
 Target = dict[str, Any]
 ROI_LEVELS = ("0", "1", "2", "3")
@@ -44,7 +44,8 @@ class NetworkConfig:
         anchor_scales: side of the anchors in px, one per pyramid level from stride 4; a fifth adds the pool level.
         fpn_channels: width of the pyramid, and of the RPN and mask heads.
         fc: width of the box and CQE heads' fully connected layers.
-        cqe: "concat" builds the CQE head, "off" leaves it out (quality is then 1).
+        cqe: how the CQE head joins feature and mask ("concat", "multiply", "add"); "off" leaves the head out, and
+            quality is then 1.
         proposals: proposals kept per image in training and at inference.
         rois: proposals per image that train the box head, a quarter of them positive.
         detections: rows of the padded output.
@@ -62,7 +63,7 @@ class NetworkConfig:
     anchor_scales: tuple[int, ...] = (32, 64, 128, 256)
     fpn_channels: int = 256
     fc: int = 1024
-    cqe: Literal["concat", "off"] = "concat"
+    cqe: Fusion | Literal["off"] = "concat"
     proposals: tuple[int, int] = (1000, 300)
     rois: int = 256
     detections: int = 100
@@ -131,7 +132,9 @@ class MaskRCNN(nn.Module):
         self.backbone = Backbone(config)
         self.rpn = _build_rpn(config)
         self.roi_heads = _build_roi_heads(config, num_classes)
-        self.cqe = CQEHead(channels, num_classes, channels, config.fc) if config.cqe != "off" else None
+        self.cqe = None
+        if config.cqe != "off":
+            self.cqe = CQEHead(channels, num_classes, channels, config.fc, fusion=config.cqe)
         self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(STD).view(3, 1, 1), persistent=False)
 

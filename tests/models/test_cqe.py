@@ -59,10 +59,30 @@ def test_without_a_positive_the_loss_is_zero_and_reaches_every_parameter():
     assert all(p.grad is not None for p in head.parameters())
 
 
-def test_the_head_learns_from_the_mask_it_is_shown():
+@pytest.mark.parametrize("fusion", ["concat", "multiply", "add"])
+def test_the_head_learns_from_the_mask_it_is_shown(fusion):
     torch.manual_seed(0)
-    head = CQEHead(4, 1, channels=8, fc=16)
+    head = CQEHead(4, 1, channels=8, fc=16, fusion=fusion)
     features, masks = torch.rand(2, 4, 14, 14), torch.rand(2, 28, 28, requires_grad=True)
-    head(features, masks).sum().backward()
+    quality = head(features, masks)
+    quality.sum().backward()
+    assert quality.shape == (2, 1)
     assert masks.grad is not None
     assert masks.grad.abs().sum() > 0
+
+
+def test_the_fusions_join_feature_and_mask_as_they_say():
+    feature, mask = torch.full((1, 2, 14, 14), 3.0), torch.zeros(1, 28, 28)
+    mask[0, 0, 1] = 0.5  # the upper left cell's largest
+    concat, multiply, add = (
+        CQEHead(2, 1, 8, 8, fusion=f).fuse(feature, mask)[0] for f in ("concat", "multiply", "add")
+    )
+    assert concat.shape == (3, 14, 14)
+    assert concat[:, 0, 0].tolist() == [3, 3, 0.5]
+    assert concat[:, 0, 1].tolist() == [3, 3, 0]
+    assert multiply.shape == (2, 14, 14)
+    assert multiply[:, 0, 0].tolist() == [1.5, 1.5]
+    assert multiply[:, 5:].abs().sum() == 0
+    assert add.shape == (2, 28, 28)
+    assert add[:, 0, 1].tolist() == [3.5, 3.5]
+    assert torch.all(add[:, 1:] == 3)
