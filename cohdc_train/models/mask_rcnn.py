@@ -20,7 +20,7 @@ from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
 from cohdc_train.models.backbones import Depth, HDCResNet, load_backbone_weights
-from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss, cqe_targets
+from cohdc_train.models.cqe import CQEHead, Fusion, Goal, cqe_loss, cqe_targets
 
 Target = dict[str, Any]
 ROI_LEVELS = ("0", "1", "2", "3")
@@ -46,6 +46,7 @@ class NetworkConfig:
         fc: width of the box and CQE heads' fully connected layers.
         cqe: how the CQE head joins feature and mask ("concat", "multiply", "add"); "off" leaves the head out, and
             quality is then 1.
+        cqe_target: what the CQE head regresses: mask IoU ("iou") or (1 + CIoU) / 2 ("ciou", the paper's S_iou).
         proposals: proposals kept per image in training and at inference.
         rois: proposals per image that train the box head, a quarter of them positive.
         detections: rows of the padded output.
@@ -64,6 +65,7 @@ class NetworkConfig:
     fpn_channels: int = 256
     fc: int = 1024
     cqe: Fusion | Literal["off"] = "concat"
+    cqe_target: Goal = "iou"
     proposals: tuple[int, int] = (1000, 300)
     rois: int = 256
     detections: int = 100
@@ -212,7 +214,8 @@ class MaskRCNN(nn.Module):
         probabilities = logits[rows, classes + 1].sigmoid()
         quality = self.cqe(pooled, probabilities.to(pooled.dtype))
         per_image = zip(probabilities.split([len(b) for b in boxes]), boxes, gt_masks, matches, strict=True)
-        truth = [cqe_targets(p, b.float(), g, m) if len(b) else b.new_zeros(0) for p, b, g, m in per_image]
+        goal = self.config.cqe_target
+        truth = [cqe_targets(p, b.float(), g, m, goal) if len(b) else b.new_zeros(0) for p, b, g, m in per_image]
         losses["cqe"] = cqe_loss(quality, classes, torch.cat(truth))
         return losses
 

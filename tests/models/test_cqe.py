@@ -1,7 +1,11 @@
 """CQE targets and loss: known answers."""
 
+import math
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cohdc_train.models.cqe import CQEHead, cqe_loss, cqe_targets
 
@@ -41,6 +45,48 @@ def test_each_box_is_held_against_its_own_object():
     boxes = torch.tensor([[60.0, 60.0, 100.0, 100.0], [10.0, 20.0, 50.0, 60.0]])
     target = cqe_targets(torch.ones(2, 28, 28), boxes, truth, torch.tensor([1, 0]))
     torch.testing.assert_close(target, torch.ones(2), atol=1e-5, rtol=0)
+
+
+def _ciou_target(box, mask=None):
+    mask = torch.ones(1, 28, 28) if mask is None else mask
+    return cqe_targets(mask, torch.tensor([box]), _scene(), torch.tensor([0]), "ciou").item()
+
+
+def test_ciou_of_a_perfect_mask_is_one():
+    assert _ciou_target([10.0, 20.0, 50.0, 60.0]) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_ciou_of_a_shifted_mask():
+    # 40 x 40 against 40 x 40, 10 px to the right: IoU 30 / 50, rho^2 = 100, c^2 = 50^2 + 40^2, same aspect
+    assert _ciou_target([20.0, 20.0, 60.0, 60.0]) == pytest.approx(0.5 * (1 + 0.6 - 100 / 4100), abs=1e-5)
+
+
+def test_ciou_of_a_mask_of_another_aspect():
+    # the upper half: IoU 1 / 2, rho^2 = 100, c^2 = 2 * 40^2
+    v = 4 / math.pi**2 * (math.atan(2) - math.atan(1)) ** 2
+    expected = 0.5 - 100 / 3200 - v * v / (0.5 + v)
+    assert _ciou_target([10.0, 20.0, 50.0, 40.0]) == pytest.approx(0.5 * (1 + expected), abs=1e-5)
+
+
+def test_ciou_counts_the_predicted_mask_and_not_its_box():
+    mask = torch.zeros(1, 28, 28)
+    mask[0, :, :14] = 1  # the left half of a box twice as wide as the object
+    assert _ciou_target([10.0, 20.0, 90.0, 60.0], mask) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_ciou_target_of_masks_that_do_not_meet_is_zero():
+    assert _ciou_target([60.0, 70.0, 90.0, 90.0]) == 0.0
+    assert _ciou_target([10.0, 20.0, 50.0, 60.0], torch.zeros(1, 28, 28)) == 0.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.tuples(*[st.floats(0, 60)] * 2), st.tuples(*[st.floats(5, 40)] * 2), st.integers(0, 99))
+def test_ciou_never_exceeds_iou(corner, extent, seed):
+    box = torch.tensor([[*corner, corner[0] + extent[0], corner[1] + extent[1]]])
+    mask = torch.rand((1, 28, 28), generator=torch.Generator().manual_seed(seed))
+    iou, both = (cqe_targets(mask, box, _scene(), torch.tensor([0]), kind).item() for kind in ("iou", "ciou"))
+    assert 0 <= both <= 0.5 * (1 + iou) + 1e-6
+    assert (both > 0) == (iou > 0)
 
 
 def test_loss_is_half_the_squared_error_over_positive_targets():

@@ -118,6 +118,16 @@ def test_background_inside_a_crowd_is_no_negative(small_config):
     assert labels[1] == [0.0, -1.0, 1.0]
 
 
+def test_the_target_of_the_quality_changes_its_loss_and_nothing_else(small_config):
+    losses = []
+    for goal in ("iou", "ciou"):
+        torch.manual_seed(0)
+        network = MaskRCNN(1, dataclasses.replace(small_config, cqe_target=goal))
+        losses.append(network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])]))
+    assert losses[0]["cqe"].item() != losses[1]["cqe"].item()
+    assert losses[0]["mask"].item() == losses[1]["mask"].item()
+
+
 def test_cqe_can_be_left_out(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, cqe="off"))
     assert "cqe" not in network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])])
