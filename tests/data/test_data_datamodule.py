@@ -97,6 +97,7 @@ def test_validation_images_are_untouched(tmp_path: Path) -> None:
     assert data.on_after_batch_transfer(batch, 0) is batch
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 2 worker processes")  # torch's advice on one core
 @pytest.mark.parametrize("workers", [0, 2])
 def test_the_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
     root = toys.folder(tmp_path)
