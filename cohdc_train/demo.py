@@ -159,7 +159,7 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
         "--seed_everything": seed,
     }
     fit = [sys.executable, "-m", "cohdc_train", "fit", *(str(part) for option in options.items() for part in option)]
-    if subprocess.run(fit, check=False).returncode != 0:
+    if subprocess.run(fit, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode != 0:
         raise CohdcError("the training ended early; its own message stands above")
     return score(out / "train" / "best.ckpt", out / "data", out / "train" / "scores.json")
 
