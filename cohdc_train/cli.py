@@ -32,7 +32,7 @@ VERBS = {
 # fmt: off
 _TRAIN_PACKAGES = frozenset({
     "torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "kornia", "rich",
-    "tensorboard", "embreex",
+    "tensorboard", "embreex", "shapely", "PIL",
 })
 # fmt: on
 

@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     "env": {"errors"},
     "contour": {"errors"},
     "trajectory": {"errors"},
-    "data": {"errors"},
+    "data": {"presets", "errors"},
     "synth": {"errors"},
     "models": set(),
     "onnx_operators": {"models"},

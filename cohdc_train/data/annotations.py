@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as rle
 
+from cohdc_train.data.image_files import check_size
 from cohdc_train.errors import DataError
 
 _CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
@@ -67,11 +68,7 @@ def read_image(image: CocoImage) -> NDArray[np.uint8]:
     pixels = cv2.imread(str(image.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise DataError(f"{image.path}: image {image.id} cannot be read as an image")
-    height, width = pixels.shape[:2]
-    if (height, width) != (image.height, image.width):
-        turned = ": annotated as shown turned by EXIF?" if (width, height) == (image.height, image.width) else ""
-        annotated = f"{image.width}x{image.height}"
-        raise DataError(f"{image.path}: image {image.id} is {width}x{height}, its annotation {annotated}{turned}")
+    check_size(image.path, image.id, pixels.shape[1::-1], (image.width, image.height))
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -79,19 +76,59 @@ def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
     """Polygons with at least three points, or a compressed RLE; empty when there is none."""
     given = row.get("segmentation") or []
     try:
-        if not isinstance(given, dict):
+        if not isinstance(given, dict | list):
+            raise TypeError("segmentation")
+        if isinstance(given, list):
             return [list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0]
         if list(given["size"]) != [image.height, image.width]:
             size = f"{image.height}x{image.width}"
             raise DataError(f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}")
+        if not fills(given["counts"], image.height * image.width):
+            raise ValueError("RLE counts")
         if isinstance(given["counts"], list):
-            if sum(given["counts"]) != image.height * image.width:
-                raise ValueError("RLE counts")
             given = rle.frPyObjects(given, image.height, image.width)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: annotation {row.get('id')}: neither polygons nor RLE") from error
     counts = given["counts"]
     return {"size": list(given["size"]), "counts": counts.decode() if isinstance(counts, bytes) else counts}
+
+
+def fills(counts: str | bytes | list[int], pixels: int) -> bool:
+    """Whether the runs of an RLE, compressed (text) or not, fill so many pixels.
+
+    pycocotools decodes a damaged one without a word, into wrong pixels.
+    """
+    try:
+        text = counts.decode() if isinstance(counts, bytes) else counts
+        runs = _decompressed(text) if isinstance(text, str) else [int(run) for run in text]
+    except (IndexError, TypeError, UnicodeDecodeError, ValueError):
+        return False
+    return min(runs, default=-1) >= 0 and sum(runs) == pixels
+
+
+def _decompressed(text: str) -> list[int]:
+    """The run lengths of COCO's compressed RLE.
+
+    Each is written in groups of 5 bits, lowest first, 32 marking that another group follows and the last group's
+    highest bit a negative number; from the fourth on, a number is the difference to the run before the last.
+    """
+    runs: list[int] = []
+    value, shift = 0, 0
+    for character in text:
+        bits = ord(character) - 48
+        if not 0 <= bits < 64:
+            raise ValueError(f"character {character!r}")
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= 1 << shift
+        runs.append(value + runs[-2] if len(runs) > 2 else value)
+        value, shift = 0, 0
+    if shift:
+        raise ValueError("ends within a number")
+    return runs
 
 
 def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:

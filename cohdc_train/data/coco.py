@@ -62,6 +62,12 @@ class CocoSplit:
         chosen = sorted(np.random.default_rng(0).permutation(len(self.images))[:count])
         return replace(self, images=tuple(self.images[i] for i in chosen))
 
+    def losses(self) -> str:
+        """What reading left out or cut, counted, in one line; empty when nothing was."""
+        parts = [f"{number} annotations dropped ({reason})" for reason, number in sorted(self.dropped.items())]
+        parts += [f"{self.clipped} clipped to the image"] if self.clipped else []
+        return f"{self.annotations}: {', '.join(parts)}" if parts else ""
+
     def ground_truth(self) -> dict[str, Any]:
         """The split as a COCO dict of its kept objects, category ids 1..C: what the scores are measured against."""
         categories = [{"id": i + 1, "name": name} for i, name in enumerate(self.class_names)]
@@ -169,10 +175,10 @@ def _read_image(files: SplitPaths, row: dict[str, Any]) -> CocoImage:
     return CocoImage(image_id, path, height, width, ())
 
 
-def _references(
-    path: Path, row: dict[str, Any], images: dict[int, CocoImage], labels: dict[int, int]
-) -> tuple[CocoImage, int]:
+def _references(path: Path, row: Any, images: dict[int, CocoImage], labels: dict[int, int]) -> tuple[CocoImage, int]:
     """The image and the label an annotation points at."""
+    if not isinstance(row, dict):
+        raise DataError(f"{path}: annotation {row!r:.40}: needs id, image_id, category_id and segmentation")
     for key, known in (("image_id", images), ("category_id", labels)):
         if row.get(key) not in known:
             raise DataError(f"{path}: annotation {row.get('id')}: {key} {row.get(key)} is not in the file")

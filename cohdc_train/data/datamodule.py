@@ -8,10 +8,12 @@ from typing import Any, NamedTuple, cast
 import cv2
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 from torchvision import tv_tensors
 
+from cohdc_train.data import image_files
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder
 from cohdc_train.data.layout import CocoPaths
@@ -163,6 +165,18 @@ class CocoDataModule(pl.LightningDataModule):
     def num_classes(self) -> int:
         """Classes without background."""
         return len(self.folder.class_names)
+
+    def setup(self, stage: str) -> None:
+        """Look at every image file before the first step and say what the annotation files lost in reading.
+
+        Raises DataError naming an image that is missing, damaged or not of its annotated size.
+        """
+        splits = [self.folder.val, *(self.folder.train if stage == "fit" else ())]
+        for split in splits:
+            if split.losses():
+                rank_zero_info(split.losses())
+            for image in split.images:
+                image_files.check(image.path, image.id, (image.width, image.height))
 
     def val_ground_truth(self) -> dict[str, Any]:
         """The validation split as a COCO dict with category ids 1..C."""

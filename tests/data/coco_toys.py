@@ -29,13 +29,14 @@ def draw_image(path: Path, rows: list[dict[str, Any]], seed: int) -> None:
 
 
 def content(images: Path, name: str, count: int) -> dict[str, Any]:
-    """`count` images, each with a person and a car; draws them into the folder."""
+    """`count` images, each with a person and a car; draws them into the folder. Those of "val" look different."""
     rows, files = [], []
+    other = name == "val"
     for i in range(1, count + 1):
-        people = rectangle(i, 10, (2 + i, 4, 16, 24), len(rows) + 1)
-        cars = rectangle(i, 20, (30, 20 + i % 4, 24, 14), len(rows) + 2)
+        people = rectangle(i, 10, (34 + i, 20, 16, 24) if other else (2 + i, 4, 16, 24), len(rows) + 1)
+        cars = rectangle(i, 20, (4, 4 + i % 4, 24, 14) if other else (30, 20 + i % 4, 24, 14), len(rows) + 2)
         file_name = f"{name}_{i}.png"
-        draw_image(images / file_name, [people, cars], i)
+        draw_image(images / file_name, [people, cars], 1000 * other + i)
         rows += [people, cars]
         files.append({"id": i, "file_name": file_name, "height": HEIGHT, "width": WIDTH})
     return {"images": files, "annotations": rows, "categories": CATEGORIES}

@@ -1,0 +1,181 @@
+"""One annotation of a COCO-format file under the magnifying glass: what is wrong with it, and its mended row."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from pycocotools import mask as rle
+from shapely import Polygon, box, clip_by_rect, get_parts
+
+from cohdc_train.data.annotations import fills
+
+_TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
+_DISAGREE, _AGREE = 0.5, 0.9  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
+_TINY = 4  # px
+Box = tuple[float, float, float, float]
+
+
+class Examined(NamedTuple):
+    """findings: kinds. row: the mended annotation, None when it has to go. shape: its compressed RLE, None likewise."""
+
+    findings: list[str]
+    row: dict[str, Any] | None
+    shape: dict[str, Any] | None
+
+
+def examine(row: dict[str, Any], height: int, width: int) -> Examined:
+    """Look at segmentation, box and area of one annotation of an image of height x width px."""
+    findings: list[str] = []
+    crowd = bool(row.get("iscrowd"))
+    if crowd:
+        findings.append("crowd")
+    segmentation = row.get("segmentation")
+    if not segmentation:
+        if crowd and _numbers(row.get("bbox"), 4):
+            return Examined(findings, row, None)
+        return Examined([*findings, "contour-missing"], None, None)
+    kinds, mended = _mend_segmentation(segmentation, height, width)
+    findings += kinds
+    if mended is None:
+        return Examined(findings, None, None)
+    shape = mended if isinstance(mended, dict) else rle.merge(rle.frPyObjects(mended, height, width))
+    pixels = int(rle.area(shape))
+    if pixels == 0:
+        return Examined([*findings, "contour-empty"], None, None)
+    if pixels < _TINY:
+        findings.append("object-tiny")
+    tight: Box = tuple(float(v) for v in rle.toBbox(shape))  # type: ignore[assignment]
+    kinds, bounds = _mend_box(row.get("bbox"), tight, height, width)
+    findings += kinds
+    area = row.get("area")
+    if not isinstance(area, int | float) or not pixels / 2 <= area <= pixels * 2:
+        findings += ["area-wrong"] if area is not None and pixels >= _TINY else []
+        area = float(pixels)
+    return Examined(findings, row | {"segmentation": mended, "bbox": list(bounds), "area": area}, shape)
+
+
+def fits(row: dict[str, Any], height: int, width: int) -> bool:
+    """Whether an annotation could be of an image of this size: its RLE's size is the same, or its points lie inside."""
+    segmentation = row.get("segmentation") or []
+    if isinstance(segmentation, dict):
+        return list(segmentation.get("size", ())) == [height, width]
+    try:
+        points = np.concatenate([np.asarray(part, dtype=float).reshape(-1, 2) for part in segmentation])
+    except ValueError:
+        return False
+    return bool((points >= -_TOLERANCE).all() and (points <= (width + _TOLERANCE, height + _TOLERANCE)).all())
+
+
+def _mend_segmentation(given: Any, height: int, width: int) -> tuple[list[str], Any]:
+    """Kinds of findings, and polygons or a compressed RLE; None when nothing is left."""
+    if isinstance(given, dict):
+        return _mend_rle(given, height, width)
+    if not isinstance(given, list):
+        return ["contour-format"], None
+    findings: list[str] = []
+    if all(isinstance(value, int | float) for value in given):
+        findings.append("contour-flat")
+        given = [given]
+    polygons: list[list[float]] = []
+    crossing = False
+    for part in given:
+        fault = _fault(part)
+        if fault:
+            findings.append(fault)
+            continue
+        outline = Polygon(np.asarray(part, dtype=float).reshape(-1, 2))
+        crossing |= not outline.is_valid and outline.area > 0
+        inside = _clipped(part, outline, height, width)
+        if inside is not None:
+            findings.append("contour-outside")
+        polygons += [list(map(float, part))] if inside is None else inside
+    if crossing and polygons:
+        findings.append("contour-crossing")
+        return findings, _text(rle.merge(rle.frPyObjects(polygons, height, width)))
+    if not polygons and "contour-outside" in findings:
+        findings.append("contour-empty")
+    return findings, polygons or None
+
+
+def _fault(part: Any) -> str:
+    """Why a polygon cannot be drawn; empty when it can."""
+    if not isinstance(part, list):
+        return "contour-format"
+    if not _numbers(part, len(part)):
+        return "contour-number"
+    if len(part) % 2:
+        return "contour-odd"
+    return "contour-short" if len(part) < 6 else ""
+
+
+def _clipped(part: list[float], outline: Polygon, height: int, width: int) -> list[list[float]] | None:
+    """What lies inside of the image of a polygon that reaches out of it; None when it does not reach out.
+
+    A crossing polygon, which shapely cannot cut, has its points moved to the edge.
+    """
+    x0, y0, x1, y1 = outline.bounds
+    if x0 >= -_TOLERANCE and y0 >= -_TOLERANCE and x1 <= width + _TOLERANCE and y1 <= height + _TOLERANCE:
+        return None
+    if not outline.is_valid:
+        points = np.clip(np.asarray(part, dtype=float).reshape(-1, 2), 0, (width, height))
+        return [points.ravel().tolist()]
+    inside = clip_by_rect(outline, 0, 0, width, height)
+    pieces = [piece for piece in get_parts(inside) if piece.geom_type == "Polygon" and piece.area > 0]
+    return [np.asarray(piece.exterior.coords)[:-1].ravel().tolist() for piece in pieces]
+
+
+def _mend_rle(given: dict[str, Any], height: int, width: int) -> tuple[list[str], dict[str, Any] | None]:
+    size, counts = given.get("size"), given.get("counts")
+    if not _numbers(size, 2) or not isinstance(counts, str | bytes | list):
+        return ["contour-format"], None
+    if list(size) != [height, width]:  # type: ignore[arg-type]
+        return ["rle-size"], None
+    if not fills(counts, height * width):
+        return ["rle-counts"], None
+    return [], _text(rle.frPyObjects(given, height, width) if isinstance(counts, list) else given)
+
+
+def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str], Box]:
+    """Kinds of findings and the box to keep: the annotated one, clipped, unless the contour's is the better."""
+    if given is None:
+        return ["box-missing"], tight
+    if not _numbers(given, 4):
+        return ["box-degenerate"], tight
+    x, y, w, h = (float(v) for v in given)
+    if w < 0 or h < 0:
+        return ["box-inverted"], tight
+    if w == 0 or h == 0:
+        return ["box-degenerate"], tight
+    inside = (max(x, 0.0), max(y, 0.0), min(x + w, width) - max(x, 0.0), min(y + h, height) - max(y, 0.0))
+    outside = max(-x, -y, x + w - width, y + h - height) > _TOLERANCE
+    if min(inside[2:]) > 0 and (_iou(inside, tight) >= _DISAGREE or _near(inside, tight)):
+        return ["box-outside"] if outside else [], inside
+    corners = (x, y, w - x, h - y)
+    if min(corners[2:]) > 0 and _iou(corners, tight) >= _AGREE:
+        return ["box-corners"], tight
+    return ["box-outside", "box-disagrees"] if outside else ["box-disagrees"], tight
+
+
+def _iou(a: Box, b: Box) -> float:
+    one, other = (box(x, y, x + w, y + h) for x, y, w, h in (a, b))
+    return float(one.intersection(other).area / max(one.union(other).area, 1e-9))
+
+
+def _near(a: Box, b: Box) -> bool:
+    """Whether no edge is off by more than the tolerance: of an object of a few px, one px is half the IoU."""
+    edges = [(v[0], v[1], v[0] + v[2], v[1] + v[3]) for v in (a, b)]
+    return all(abs(one - other) <= _TOLERANCE for one, other in zip(*edges, strict=True))
+
+
+def _numbers(values: Any, count: int) -> bool:
+    return (
+        isinstance(values, list | tuple)
+        and len(values) == count
+        and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
+    )
+
+
+def _text(encoded: dict[str, Any]) -> dict[str, Any]:
+    """A compressed RLE whose counts are text, as JSON wants them."""
+    counts = encoded["counts"]
+    return {"size": list(encoded["size"]), "counts": counts.decode() if isinstance(counts, bytes) else counts}

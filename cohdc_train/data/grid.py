@@ -1,0 +1,58 @@
+"""Annotated images side by side in one picture (OpenCV, no torch)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.data.annotations import CocoImage, read_image
+from cohdc_train.data.coco import CocoSplit
+from cohdc_train.files import write_bytes
+
+_TILE = (240, 320)  # px, height and width
+_FILL = 0.45
+
+
+def draw_grid(splits: Sequence[CocoSplit], path: Path, columns: int = 4, rows: int = 3) -> None:
+    """Write a JPEG of images drawn at random, always the same ones, half of them of each split; objects are tinted by
+    class and outlined, crowds white. Raises DataError naming an image that cannot be read."""
+    tiles = []
+    for split in splits:
+        filled = [image for image in split.images if image.objects]
+        order = np.random.default_rng(0).permutation(len(filled))[: columns * rows // len(splits)]
+        tiles += [_tile(filled[i], split) for i in order]
+    tiles += [np.zeros((*_TILE, 3), np.uint8)] * (-len(tiles) % columns)
+    picture = np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+    write_bytes(path, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+
+
+def _tile(image: CocoImage, split: CocoSplit) -> NDArray[np.uint8]:
+    """One image, BGR, fitted into a tile."""
+    pixels = np.ascontiguousarray(read_image(image)[:, :, ::-1])
+    scale = min(_TILE[0] / image.height, _TILE[1] / image.width)
+    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    shown = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    for o in image.objects:
+        if not o.segmentation:
+            continue
+        mask = cv2.resize(o.mask(image.height, image.width), size, interpolation=cv2.INTER_NEAREST)
+        colour = (255, 255, 255) if o.crowd else _colour(o.label)
+        inside = mask.astype(bool)
+        shown[inside] = ((1 - _FILL) * shown[inside] + _FILL * np.array(colour)).astype(np.uint8)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(shown, outlines, -1, colour, 1)
+    tile = np.zeros((*_TILE, 3), np.uint8)
+    tile[: size[1], : size[0]] = shown
+    caption = f"{split.name} {image.path.name}"
+    for thick, ink in ((3, (0, 0, 0)), (1, (255, 255, 255))):
+        cv2.putText(tile, caption, (4, _TILE[0] - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, thick, cv2.LINE_AA)
+    return tile
+
+
+def _colour(label: int) -> tuple[int, int, int]:
+    """A colour of its own per class, BGR: hues a golden section apart."""
+    hue = np.array([[[round(label * 0.618 * 180) % 180, 220, 255]]], np.uint8)
+    b, g, r = (int(v) for v in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
+    return b, g, r

@@ -1,0 +1,160 @@
+"""The doctor on folders that are broken on purpose: it names each, training agrees with it, and the mend holds."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import broken_folders
+import coco_toys as toys
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.image_list import ImageList
+from torchvision.ops import box_iou
+
+from cohdc_train.cli import main
+from cohdc_train.data.anchors import best_overlap
+from cohdc_train.data.annotations import fills
+from cohdc_train.data.datamodule import CocoDataModule
+from cohdc_train.data.findings import KINDS
+from cohdc_train.data.layout import CocoPaths
+from cohdc_train.errors import DataError
+
+# Errors about what is learned and scored, not about what can be read.
+READABLE_ERRORS = {"leak", "box-corners"}
+
+
+def findings(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[str]]]]:
+    """Exit code, and kind -> places of both splits."""
+    code = main(["data", "doctor", str(root), "--out", str(root / "seen"), *options])
+    return code, json.loads((root / "seen" / "findings.json").read_text())
+
+
+def train_once(paths: dict[str, Any]) -> int:
+    """Every batch of a training; returns the number of objects in them."""
+    data = CocoDataModule(canvas=(32, 48), batch_size=2, workers=0, **paths)
+    data.setup("fit")
+    torch.manual_seed(0)
+    batches = [data.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
+    assert all(torch.isfinite(batch.images).all() for batch in batches)
+    assert len(list(data.val_dataloader())) == 1
+    return sum(len(target["labels"]) for batch in batches for target in batch.targets)
+
+
+def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = findings(broken_folders.whole(tmp_path / "a"))
+    assert code == 0
+    assert found == {"train": {"category-gap": ["10, 20"]}, "val": {"category-gap": ["10, 20"]}}
+    printed = capsys.readouterr().out
+    assert "images 6; objects 12; class person 6; class car 6" in printed
+    assert "Table 3 columns it has images enough for: none" in printed
+    assert (tmp_path / "a" / "seen" / "annotations.jpg").stat().st_size > 1000
+
+
+def test_the_corpus_is_large_and_shows_most_kinds() -> None:
+    shown = {case.kind for case in broken_folders.BROKEN.values()}
+    assert len(broken_folders.BROKEN) >= 50
+    assert set(KINDS) - shown == {"category-gap", "category-unused", "class-only-val", "image-empty"}
+
+
+@pytest.mark.parametrize("name", broken_folders.BROKEN)
+def test_it_is_found_training_agrees_and_the_mend_holds(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = broken_folders.BROKEN[name]
+    root = broken_folders.build(tmp_path / "a", name)
+    before = (root / "instances_train.json").read_bytes()
+    code, found = findings(root, "--fix", str(tmp_path / "mended"))
+    assert case.kind in found["train"]
+    errors = {kind for kind in found["train"] if KINDS[kind].severity == "error"}
+    assert code == (1 if errors else 0)
+    told = capsys.readouterr()
+    assert f"[{case.kind}]" in told.out
+    assert ("errors (" in told.err) == bool(errors)
+    assert (root / "instances_train.json").read_bytes() == before
+
+    if errors - READABLE_ERRORS:
+        with pytest.raises(DataError) as caught:
+            train_once({"root": root})
+        assert len(str(caught.value).splitlines()) == 1
+    else:
+        assert train_once({"root": root}) > 5
+    if case.mended:
+        check_mended(tmp_path / "mended", root)
+
+
+def check_mended(folder: Path, root: Path) -> None:
+    """The mended files train without a loss, hold no error, and with the removed rows all that there was."""
+    images = root / "images"
+    files = {name: folder / f"instances_{name}.json" for name in ("train", "val")}
+    paths = CocoPaths(files["train"], images, files["val"], images)
+    assert train_once({"paths": paths}) > 5
+    data = CocoDataModule(paths=paths)
+    assert data.folder.train[0].losses() == ""
+    removed = json.loads((folder / "removed.json").read_text())
+    for name, file in files.items():
+        given, kept = json.loads((root / file.name).read_text()), json.loads(file.read_text())
+        for key in ("images", "annotations", "categories"):
+            gone = [row for row in removed[name] if row["row"] not in kept[key] and row["row"] in given[key]]
+            assert len(kept[key]) + len(gone) == len(given[key]), (key, gone)
+    linked = root.parent / "linked"
+    linked.mkdir()
+    (linked / "images").symlink_to(images)
+    for file in files.values():
+        (linked / file.name).write_bytes(file.read_bytes())
+    code, found = findings(linked)
+    assert code == 0
+    still = {kind for split in found.values() for kind in split if KINDS[kind].severity == "warning"}
+    assert still <= {"image-exif", "image-colour", "category-unused", "class-only-val"}
+
+
+def test_the_mend_never_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = broken_folders.build(tmp_path / "a", "box elsewhere")
+    before = (root / "instances_train.json").read_bytes()
+    assert main(["data", "doctor", str(root), "--fix", str(root)]) == 1
+    assert "would overwrite" in capsys.readouterr().err
+    assert (root / "instances_train.json").read_bytes() == before
+
+
+def test_a_class_that_only_validation_has_objects_of(tmp_path: Path) -> None:
+    root = toys.folder(tmp_path / "a")
+    content = json.loads((root / "instances_train.json").read_text())
+    content["annotations"] = [row for row in content["annotations"] if row["category_id"] == 10][1:]
+    toys.write(root / "instances_train.json", content)
+    code, found = findings(root)
+    assert code == 0
+    assert found["val"]["class-only-val"] == ["car"]
+    assert found["train"]["category-unused"] == ["car"]
+    assert found["train"]["image-empty"] == ["train_1.png"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(0, 4000), min_size=1, max_size=9))
+def test_runs_are_read_as_pycocotools_writes_them(runs: list[int]) -> None:
+    from pycocotools import mask as rle
+
+    pixels = sum(runs)
+    if pixels == 0:
+        return
+    encoded = rle.frPyObjects({"size": [pixels, 1], "counts": runs}, pixels, 1)["counts"]
+    assert fills(runs, pixels)
+    assert fills(encoded, pixels)
+    assert fills(encoded.decode(), pixels)
+    assert not fills(encoded.decode(), pixels + 1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_anchor_overlap_is_torchvisions(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    canvas, scales = (128, 192), (16, 32, 64, 128, 100)
+    corner = rng.uniform((0, 0), (150, 90), (12, 2))
+    boxes = np.concatenate([corner, corner + rng.uniform(4, 60, (12, 2))], axis=1).clip(0, (192, 128, 192, 128))
+    maps = [torch.zeros(1, 1, -(-canvas[0] // s), -(-canvas[1] // s)) for s in (4, 8, 16, 32, 64)]
+    generator = AnchorGenerator(tuple((s,) for s in scales), ((0.5, 1.0, 2.0),) * 5)
+    (anchors,) = generator(ImageList(torch.zeros(1, 3, *canvas), [canvas]), maps)
+    best = box_iou(torch.from_numpy(boxes).float(), anchors).amax(dim=1).numpy()
+    np.testing.assert_allclose(best_overlap(boxes, scales, canvas), best, atol=1e-4)
