@@ -72,14 +72,19 @@ class Tracker:
         """Find the camera of the next frame.
 
         rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, 0 = no reading; t: s, rising;
-        mask: [H, W] bool, True = dynamic: nothing is taken from there.
+        mask: [H, W] bool, True = dynamic: nothing is taken from there into the map. Where what is left does not carry
+        a pose, the whole picture is matched against the map, whose points stand still; such a frame is no keyframe.
         """
         start = time.perf_counter()
         features = self._extract(rgb, depth_m, mask)
-        self.features = features
         fit = self._locate(features, rgb)
+        covered = fit is None and mask is not None and bool(self.map.keyframes)
+        if covered:
+            features = self._extract(rgb, depth_m)
+            fit = self._locate(features, rgb)
+        self.features = features
         tracked = time.perf_counter()
-        keyframe = fit is not None and self._wants_keyframe(features, fit)
+        keyframe = fit is not None and not covered and self._wants_keyframe(fit)
         if fit is not None and keyframe:
             fit = self._add_keyframe(features, fit, t, rgb)
         self._remember(fit, t)
@@ -161,7 +166,7 @@ class Tracker:
                 return fit
         return None
 
-    def _wants_keyframe(self, features: Features, fit: _Fit) -> bool:
+    def _wants_keyframe(self, fit: _Fit) -> bool:
         if not self.map.keyframes:
             return True
         if self._since_keyframe >= _KEYFRAME_FRAMES:

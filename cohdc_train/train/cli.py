@@ -93,7 +93,7 @@ def score(
     (scores,) = trainer.validate(module, datamodule=data, verbose=False)
     results = {name.removeprefix("val/"): value for name, value in scores.items()}
     for name, value in results.items():
-        print(f"{name:<14}{value:.4f}")
+        print(f"{name:<24}{value:.4f}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, results)

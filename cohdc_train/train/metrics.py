@@ -1,4 +1,5 @@
-"""Scores of instance segmentation: COCO AP of boxes and masks, mIoU, and the paper's S > 90 (section 3.1, Table 4)."""
+"""Scores of instance segmentation: COCO AP of boxes, masks and their boundaries, mIoU, the paper's S > 90 (section 3.1,
+Table 4), and how well CQE's quality tells the true IoU."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,15 +10,18 @@ import torch
 from faster_coco_eval import COCO, COCOeval_faster
 from numpy.typing import NDArray
 from pycocotools import mask as rle
+from scipy.stats import spearmanr
 from torch import Tensor
 
 from cohdc_train.masks import paste_roi_mask
 
 MATCH_IOU = 0.5  # mask IoU from which a detection counts as having found an object
 HIGH_QUALITY = 0.9  # S > 90
+CERTAIN = 0.5  # class score from which a detection counts for the quality's calibration
 _MAX_DETECTIONS = 100  # per image, COCO's
 
 Row = dict[str, Any]
+Kind = Literal["segm", "boundary", "bbox"]
 
 
 def encode(image_id: int, size: tuple[int, int], detections: Mapping[str, Tensor]) -> list[Row]:
@@ -64,9 +68,10 @@ class SegmentationMetrics:
         self._seen[image_id] = encode(image_id, self._sizes[image_id], detections)
 
     def compute(self) -> dict[str, float]:
-        """Scores over every image seen by any process: {segm,box}_{AP,AP50,AP70}, mIoU, S90_matched, S90_all.
+        """Scores over every image seen by any process.
 
-        A score whose denominator is empty (no object, no match) is nan.
+        {segm,boundary,box}_{AP,AP50,AP70}, mIoU, S90_matched, S90_all, quality_{spearman,error}, and with several
+        classes segm_AP/NAME of each that has objects. A score whose denominator is empty (no object, no match) is nan.
         """
         seen = _gather(self._seen)
         truth = _restrict(self.ground_truth, seen)
@@ -74,18 +79,22 @@ class SegmentationMetrics:
         boxes = [{k: row[k] for k in ("image_id", "category_id", "score", "bbox")} for row in rows]
         masks = [_mask_row(row, self.rescore) for row in rows]
         scores: dict[str, float] = {}
-        for prefix, kind, results in (("segm", "segm", masks), ("box", "bbox", boxes)):
-            precision = average_precision(truth, results, kind)  # type: ignore[arg-type]
+        kinds: tuple[tuple[str, Kind, list[Row]], ...]
+        kinds = (("segm", "segm", masks), ("boundary", "boundary", masks), ("box", "bbox", boxes))
+        for prefix, kind, results in kinds:
+            precision = average_precision(truth, results, kind)
+            if kind != "segm":
+                precision = {name: value for name, value in precision.items() if "/" not in name}
             scores.update({f"{prefix}_{name}": value for name, value in precision.items()})
-        return {**scores, **overlap_scores(match_masks(truth, masks))}
+        return {**scores, **overlap_scores(match_masks(truth, masks)), **calibration(truth, rows)}
 
 
-def average_precision(
-    ground_truth: Mapping[str, Any], results: Sequence[Row], kind: Literal["segm", "bbox"]
-) -> dict[str, float]:
+def average_precision(ground_truth: Mapping[str, Any], results: Sequence[Row], kind: Kind) -> dict[str, float]:
     """COCO's AP (IoU .5:.95), AP50 (the paper's mAP@.5) and AP70 (mAP@.7), mean over the classes that have objects.
 
-    Crowd objects are ignored as COCO does; at most 100 detections per image. nan without any object.
+    With several classes also AP/NAME of each that has objects. "boundary" takes the smaller of mask IoU and Boundary
+    IoU (Cheng et al. 2021, band of 2 % of the image's diagonal). Crowd objects are ignored as COCO does; at most 100
+    detections per image. nan without any object.
     """
     truth = COCO({key: list(ground_truth[key]) for key in ("images", "categories", "annotations")})
     evaluation = COCOeval_faster(truth, truth.loadRes([dict(row) for row in results]), kind, print_function=_silent)
@@ -93,7 +102,10 @@ def average_precision(
     evaluation.accumulate()
     precision = np.asarray(evaluation.eval["precision"])[:, :, :, 0, -1]  # [IoU, recall, class], all areas
     thresholds = np.asarray(evaluation.params.iouThrs)
+    names = [row["name"] for row in sorted(ground_truth["categories"], key=lambda row: row["id"])]
+    per_class = {f"AP/{name}": _mean_valid(precision[:, :, i]) for i, name in enumerate(names) if len(names) > 1}
     return {
+        **{name: value for name, value in per_class.items() if not np.isnan(value)},
         "AP": _mean_valid(precision),
         "AP50": _mean_valid(precision[np.isclose(thresholds, 0.5)]),
         "AP70": _mean_valid(precision[np.isclose(thresholds, 0.7)]),
@@ -106,16 +118,45 @@ def match_masks(ground_truth: Mapping[str, Any], results: Iterable[Row]) -> NDAr
     As COCO matches at IoU >= .5: in each image and class, detections from the best score down take the free object they
     overlap most.
     """
+    found: dict[tuple[int, int], list[Row]] = defaultdict(list)
+    for row in results:
+        found[row["image_id"], row["category_id"]].append(row)
+    objects = _objects(ground_truth)
+    return np.concatenate([np.zeros(0), *(_match(shapes, found[key]) for key, shapes in objects.items())])
+
+
+def calibration(ground_truth: Mapping[str, Any], rows: Iterable[Row]) -> dict[str, float]:
+    """How well `quality` tells the true mask IoU, over detections of class score .5 and more (`encode`'s rows).
+
+    The true IoU is the largest with an object of the same image and class, crowds left out. quality_spearman: rank
+    correlation; quality_error: mean absolute difference. nan where there are fewer than three, or all the same.
+    """
+    objects = _objects(ground_truth)
+    pairs = []
+    for row in rows:
+        if row["score"] >= CERTAIN:
+            shapes = objects.get((row["image_id"], row["category_id"]), [])
+            overlap = rle.iou([row["segmentation"]], shapes, [0] * len(shapes)) if shapes else np.zeros(1)
+            pairs.append((row["quality"], float(np.max(overlap))))
+    quality, true = np.array(pairs).reshape(-1, 2).T
+    if len(pairs) < 3:
+        return {"quality_spearman": np.nan, "quality_error": np.nan}
+    ranked = np.ptp(quality) > 0 and np.ptp(true) > 0
+    return {
+        "quality_spearman": float(spearmanr(quality, true).statistic) if ranked else np.nan,
+        "quality_error": float(np.abs(quality - true).mean()),
+    }
+
+
+def _objects(ground_truth: Mapping[str, Any]) -> dict[tuple[int, int], list[Any]]:
+    """(image id, category id) -> compressed RLE of its objects that are no crowd."""
     sizes = {image["id"]: (image["height"], image["width"]) for image in ground_truth["images"]}
     objects: dict[tuple[int, int], list[Any]] = defaultdict(list)
-    found: dict[tuple[int, int], list[Row]] = defaultdict(list)
     for row in ground_truth["annotations"]:
         if not row["iscrowd"]:
             shape = _to_rle(row["segmentation"], sizes[row["image_id"]])
             objects[row["image_id"], row["category_id"]].append(shape)
-    for row in results:
-        found[row["image_id"], row["category_id"]].append(row)
-    return np.concatenate([np.zeros(0), *(_match(shapes, found[key]) for key, shapes in objects.items())])
+    return objects
 
 
 def overlap_scores(overlaps: NDArray[np.float64]) -> dict[str, float]:

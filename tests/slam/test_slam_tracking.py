@@ -69,11 +69,25 @@ def test_nothing_to_see_is_lost_not_guessed() -> None:
     assert tracker.trajectory()[1].shape == (0, 4, 4)
 
 
-def test_a_frame_wholly_under_its_mask_is_lost(views: list[View]) -> None:
+EVERYTHING = np.ones((240, 320), dtype=np.bool_)
+
+
+def test_a_first_frame_wholly_under_its_mask_is_lost(views: list[View]) -> None:
     tracker = Tracker(CAMERA, features=500)
     rgb, depth, _ = views[0]
-    assert not tracker.track(rgb, depth, 0.0, np.ones((240, 320), dtype=np.bool_)).tracked
+    assert not tracker.track(rgb, depth, 0.0, EVERYTHING).tracked
     assert tracker.track(rgb, depth, 0.1).tracked
+
+
+def test_a_mask_over_everything_costs_no_frame_once_there_is_a_map(views: list[View]) -> None:
+    tracker = Tracker(CAMERA, features=500)
+    poses = [
+        tracker.track(rgb, depth, index / 30, EVERYTHING if 10 <= index < 25 else None)
+        for index, (rgb, depth, _) in enumerate(views)
+    ]
+    assert all(pose.tracked for pose in poses)
+    assert not any(pose.keyframe for pose in poses[10:25]), "what a mask covers never enters the map"
+    assert ate(tracker, camera_path(40)) < 0.005
 
 
 def features_at(points: list[tuple[float, float]], words: list[int], octaves: list[int]) -> Features:

@@ -52,6 +52,8 @@ def test_a_fit_leaves_checkpoints_logs_and_its_configuration(run: Path) -> None:
         "val/segm_AP",
         "val/segm_AP50",
         "val/segm_AP70",
+        "val/boundary_AP",
+        "val/quality_error",
         "val/box_AP",
         "val/mIoU",
         "val/S90_matched",

@@ -13,7 +13,14 @@ from pycocotools import mask as rle
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from cohdc_train.train.metrics import SegmentationMetrics, average_precision, encode, match_masks, overlap_scores
+from cohdc_train.train.metrics import (
+    SegmentationMetrics,
+    average_precision,
+    calibration,
+    encode,
+    match_masks,
+    overlap_scores,
+)
 
 SIZE = (60, 80)
 
@@ -78,7 +85,46 @@ def test_average_precision_equals_pycocotools(seed: int, kind: Any) -> None:
     rows = [{k: r[k] for k in keys} for r in results]
     ours, theirs = average_precision(truth, rows, kind), reference(truth, rows, kind)
     assert 0 < theirs["AP"] < 1
+    per_class = [ours.pop(name) for name in ("AP/c1", "AP/c2")]  # c3 has no objects
     assert ours == pytest.approx(theirs, abs=1e-6)
+    assert np.mean(per_class) == pytest.approx(theirs["AP"], abs=1e-6)
+
+
+def band(mask: NDArray[np.uint8], width: int) -> NDArray[np.bool_]:
+    """The pixels of a mask that have one outside of it, or the picture's edge, within `width` rows and columns."""
+    inner = np.ones(mask.shape, np.bool_)
+    padded = np.pad(mask, width)
+    for dy in range(2 * width + 1):
+        for dx in range(2 * width + 1):
+            inner &= padded[dy : dy + mask.shape[0], dx : dx + mask.shape[1]] > 0
+    return (mask > 0) & ~inner
+
+
+@pytest.mark.parametrize("shift", [0, 1, 2, 3, 5])
+def test_boundary_ap_takes_the_smaller_of_mask_and_boundary_iou(shift: int) -> None:
+    truth, seen = square(20, 15, 30), square(20 + shift, 15, 30)
+    edges = [band(mask, 2) for mask in (truth, seen)]  # 2 % of a diagonal of 100 px
+    ious = [(a & b).sum() / (a | b).sum() for a, b in ((truth > 0, seen > 0), edges)]
+    passed = sum(min(ious) >= threshold for threshold in np.arange(0.5, 1.0, 0.05) - 1e-9)
+    row = row_of(seen, image_id=7, category_id=1, score=0.9)
+    found = average_precision(truth_of(truth), [row], "boundary")
+    assert found["AP"] == pytest.approx(passed / 10)
+
+
+def test_calibration_compares_quality_with_the_true_iou() -> None:
+    truth = truth_of(square(10, 10, 20), square(50, 10, 20))
+    moved = [square(10, 10, 20), square(50, 14, 20), square(10, 40, 10), square(50, 10, 20)]
+    true = [1.0, 320 / 480, 0.0, 1.0]
+    quality, scores = [0.9, 0.7, 0.2, 0.1], [0.9, 0.8, 0.7, 0.4]  # the last is not sure enough to count
+    rows = [
+        row_of(m, image_id=7, category_id=1, score=s, quality=q) for m, s, q in zip(moved, scores, quality, strict=True)
+    ]
+    found = calibration(truth, rows)
+    assert found["quality_spearman"] == pytest.approx(1.0)
+    assert found["quality_error"] == pytest.approx(np.mean(np.abs(np.subtract(quality, true))[:3]))
+    assert all(math.isnan(value) for value in calibration(truth, rows[:2]).values())
+    same = [row | {"quality": 1.0} for row in rows]
+    assert math.isnan(calibration(truth, same)["quality_spearman"])
 
 
 def square(x: int, y: int, side: int) -> NDArray[np.uint8]:
