@@ -19,10 +19,10 @@ from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder
 from cohdc_train.data.layout import CocoPaths
 from cohdc_train.data.transforms import (
     Augmentation,
+    TrainingTransform,
     blank_padding,
     mask_boxes,
     photometric_augmentation,
-    training_transform,
 )
 
 Target = dict[str, Any]
@@ -63,7 +63,7 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
 
     def __init__(self, split: CocoSplit, canvas: tuple[int, int], augment: Augmentation) -> None:
         self.split = split
-        self.transform = training_transform(canvas, augment)
+        self.transform = TrainingTransform(canvas, augment)
 
     def __len__(self) -> int:
         return len(self.split.images)
@@ -75,17 +75,14 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         objects = [o for o in image.objects if not o.crowd]
         crowd = torch.tensor([o.box for o in image.objects if o.crowd], dtype=torch.float32).reshape(-1, 4)
         crowd[:, 2:] += crowd[:, :2]
-        masks = torch.zeros((len(objects), *size), dtype=torch.uint8)
-        for mask, o in zip(masks, objects, strict=True):
-            mask.copy_(torch.from_numpy(o.mask(*size)))
+        masks = (torch.from_numpy(o.mask(*size)) for o in objects)
         sample = {
             "image": tv_tensors.Image(torch.from_numpy(read_image(image)).permute(2, 0, 1)),
             "content": tv_tensors.Mask(torch.ones((1, *size), dtype=torch.uint8)),
-            "masks": tv_tensors.Mask(masks),
             "ignore": tv_tensors.BoundingBoxes(crowd, format="XYXY", canvas_size=size),
         }
         labels = torch.tensor([o.label for o in objects], dtype=torch.int64)
-        out = {name: value.as_subclass(Tensor) for name, value in self.transform(sample).items()}
+        out = {name: value.as_subclass(Tensor) for name, value in self.transform(sample, masks).items()}
         return out["image"], _target(out, labels, image.id)
 
 

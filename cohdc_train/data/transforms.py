@@ -1,5 +1,6 @@
 """Training geometry on the CPU (torchvision.transforms.v2) and photometry on the device (kornia)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,8 +67,6 @@ class JitteredCrop(v2.Transform):  # type: ignore[misc]  # torchvision is not ty
             return resized_crop(inpt, **params, antialias=True)
         bottom, right = params["top"] + params["height"], params["left"] + params["width"]
         window = inpt.as_subclass(Tensor)[:, params["top"] : bottom, params["left"] : right]
-        if not len(window):
-            return tv_tensors.Mask(window.new_zeros((0, *params["size"])))
         return tv_tensors.Mask(F.interpolate(window[None], params["size"], mode="nearest-exact")[0])
 
 
@@ -88,16 +87,28 @@ class PadToCanvas(v2.Transform):  # type: ignore[misc]
         return pad(inpt, **params)
 
 
-def training_transform(canvas: tuple[int, int], augment: Augmentation) -> v2.Compose:
+class TrainingTransform:
     """Scale jitter with crop, horizontal flip, padding to the canvas; boxes are clamped to what is left of them."""
-    return v2.Compose(
-        [
-            JitteredCrop(canvas, augment.scale_jitter),
-            v2.RandomHorizontalFlip(augment.flip),
-            v2.ClampBoundingBoxes(),
-            PadToCanvas(canvas),
-        ]
-    )
+
+    def __init__(self, canvas: tuple[int, int], augment: Augmentation) -> None:
+        self._crop = JitteredCrop(canvas, augment.scale_jitter)
+        self._rest = v2.Compose(
+            [v2.RandomHorizontalFlip(augment.flip), v2.ClampBoundingBoxes(), PadToCanvas(canvas)],
+        )
+
+    def __call__(self, sample: dict[str, Any], masks: Iterable[Tensor]) -> dict[str, Any]:
+        """A sample on the canvas, with `masks` [n, H, W] in it.
+
+        sample: an `image` and whatever boxes and masks belong to it; masks: of the image's size, [height, width] each,
+        taken one at a time, so that however many objects a large image has, one mask of its size is in memory.
+        """
+        params = self._crop.make_params([sample["image"]])
+        out = {name: self._crop.transform(value, params) for name, value in sample.items()}
+        cut = [self._crop.transform(tv_tensors.Mask(mask[None]), params) for mask in masks]
+        none = tv_tensors.Mask(torch.zeros((0, *params["size"]), dtype=torch.uint8))
+        out["masks"] = tv_tensors.Mask(torch.cat(cut)) if cut else none
+        result: dict[str, Any] = self._rest(out)
+        return result
 
 
 def mask_boxes(masks: Tensor) -> Tensor:

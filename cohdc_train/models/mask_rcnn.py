@@ -204,8 +204,11 @@ class MaskRCNN(nn.Module):
         matches = [m[p] for m, p in zip(matched, positive, strict=True)]
         pooled = heads.mask_roi_pool(features, boxes, sizes)
         logits = heads.mask_predictor(heads.mask_head(pooled)).float()
-        gt_masks = [t["masks"] for t in targets]
-        gt_labels = [t["labels"] for t in targets]
+        # The losses turn masks into float32: only those of the sampled objects, however many the image has.
+        used = [torch.unique(m, return_inverse=True) for m in matches]
+        matches = [place for _, place in used]
+        gt_masks = [t["masks"][chosen] for t, (chosen, _) in zip(targets, used, strict=True)]
+        gt_labels = [t["labels"][chosen] for t, (chosen, _) in zip(targets, used, strict=True)]
         losses = {"mask": maskrcnn_loss(logits, boxes, gt_masks, gt_labels, matches)}
         if self.cqe is None:
             return losses

@@ -1,10 +1,14 @@
 """Batches: shapes, types, ranges, and the same ones for the same seed."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import coco_toys as toys
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -117,3 +121,36 @@ def test_subsets_and_several_roots(tmp_path: Path) -> None:
     assert len(data.val_dataloader().dataset) == 1  # type: ignore[arg-type]
     with pytest.raises(DataError, match="asked for"):
         _ = CocoDataModule(roots[0], subset=Subset(val=3)).folder
+
+
+_PEAK = """
+import resource, sys
+import torch
+from cohdc_train.data.datamodule import CocoDataModule
+from cohdc_train.models import MaskRCNN, NetworkConfig
+
+torch.set_num_threads(1)
+data = CocoDataModule(sys.argv[1], canvas=(256, 384), batch_size=1, workers=0)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+torch.manual_seed(0)
+batch = next(iter(data.train_dataloader()))
+network = MaskRCNN(2, NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384)))
+losses = network.losses(batch.images.float() / 255, batch.targets)
+sum(losses.values()).backward()
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(len(batch.targets[0]["labels"]), (after - before) // 1024)
+"""
+
+
+@pytest.mark.slow
+def test_hundreds_of_objects_on_a_large_image_take_little_memory(tmp_path: Path) -> None:
+    """All masks at the image's size would be 9.6 GB."""
+    root, height, width = toys.folder(tmp_path), 4000, 6000
+    cv2.imwrite(str(root / "images" / "large.jpg"), np.full((height, width, 3), 120, np.uint8))
+    rows = [toys.rectangle(1, 10, (i % 20 * 290, i // 20 * 190, 250, 160), i + 1) for i in range(400)]
+    image = {"id": 1, "file_name": "large.jpg", "height": height, "width": width}
+    toys.write(root / "instances_train.json", {"images": [image], "annotations": rows, "categories": toys.CATEGORIES})
+    done = subprocess.run([sys.executable, "-c", _PEAK, str(root)], capture_output=True, text=True, check=True)
+    objects, mebibytes = (int(word) for word in done.stdout.split())
+    assert objects > 100
+    assert mebibytes < 1000
