@@ -67,6 +67,7 @@ def score(
     root: Path,
     out: Path | None = None,
     rescore: bool | None = None,
+    min_quality: float = 0.0,
     batch_size: int = 2,
     workers: int = 1,
     precision: str = "32-true",
@@ -79,6 +80,7 @@ def score(
         root: the COCO-format folder; its other classes are left out.
         out: JSON file for the scores.
         rescore: rank masks by score * quality; the training's choice when not given.
+        min_quality: leave out detections of a lower quality, as the paper does below 0.9.
         batch_size: images per batch.
         workers: processes that read images.
         precision: Lightning's precision, such as bf16-mixed.
@@ -86,6 +88,7 @@ def score(
     """
     module = MaskRCNNModule.load(checkpoint, canvas)
     module.rescore = module.rescore if rescore is None else rescore
+    module.min_quality = min_quality
     data = CocoDataModule(root, module.class_names, module.network_config.canvas, batch_size, workers)
     if data.class_names != module.class_names:
         raise CohdcError(f"{root}: class order {data.class_names} is not the checkpoint's {module.class_names}")

@@ -55,11 +55,14 @@ class SegmentationMetrics:
     Args:
         ground_truth: `images`, `categories` with ids 1..C, `annotations`; only the images that were seen are scored.
         rescore: mask AP ranks by score * quality (Mask Scoring R-CNN) instead of by score; box AP never does.
+        min_quality: detections of a lower quality are left out of every score but the quality's own calibration; the
+            paper's filter is .9.
     """
 
-    def __init__(self, ground_truth: Mapping[str, Any], rescore: bool = True) -> None:
+    def __init__(self, ground_truth: Mapping[str, Any], rescore: bool = True, min_quality: float = 0.0) -> None:
         self.ground_truth = ground_truth
         self.rescore = rescore
+        self.min_quality = min_quality
         self._seen: dict[int, list[Row]] = {}
         self._sizes = {int(i["id"]): (int(i["height"]), int(i["width"])) for i in ground_truth["images"]}
 
@@ -75,7 +78,8 @@ class SegmentationMetrics:
         """
         seen = _gather(self._seen)
         truth = _restrict(self.ground_truth, seen)
-        rows = [row for image_id in sorted(seen) for row in seen[image_id]]
+        everything = [row for image_id in sorted(seen) for row in seen[image_id]]
+        rows = [row for row in everything if row["quality"] >= self.min_quality]
         boxes = [{k: row[k] for k in ("image_id", "category_id", "score", "bbox")} for row in rows]
         masks = [_mask_row(row, self.rescore) for row in rows]
         scores: dict[str, float] = {}
@@ -86,7 +90,7 @@ class SegmentationMetrics:
             if kind != "segm":
                 precision = {name: value for name, value in precision.items() if "/" not in name}
             scores.update({f"{prefix}_{name}": value for name, value in precision.items()})
-        return {**scores, **overlap_scores(match_masks(truth, masks)), **calibration(truth, rows)}
+        return {**scores, **overlap_scores(match_masks(truth, masks)), **calibration(truth, everything)}
 
 
 def average_precision(ground_truth: Mapping[str, Any], results: Sequence[Row], kind: Kind) -> dict[str, float]:

@@ -78,6 +78,7 @@ class MaskRCNNModule(pl.LightningModule):
         self.network_config = _rebuild(NetworkConfig, network)
         self.optimizer_config = _rebuild(OptimizerConfig, optimizer)
         self.rescore = rescore
+        self.min_quality = 0.0  # of the detections that validation scores
         # Plain values only, so that a checkpoint loads under torch.load(weights_only=True).
         self.save_hyperparameters(
             {
@@ -128,7 +129,7 @@ class MaskRCNNModule(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """Begin new scores."""
-        self._metrics = SegmentationMetrics(self._data().val_ground_truth(), self.rescore)
+        self._metrics = SegmentationMetrics(self._data().val_ground_truth(), self.rescore, self.min_quality)
 
     def validation_step(self, batch: list[ValSample], batch_idx: int) -> None:
         """Collect the detections of the batch's images."""

@@ -174,6 +174,17 @@ def test_rescoring_ranks_masks_by_quality_and_leaves_boxes() -> None:
     assert scores[True]["box_AP"] == scores[False]["box_AP"] == pytest.approx(0.5)
 
 
+def test_the_filter_leaves_out_what_quality_doubts() -> None:
+    boxes = [[10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0]]
+    found = []
+    for least in (0.0, 0.9):
+        metrics = SegmentationMetrics(truth_of(square(10, 10, 20), square(50, 10, 20)), min_quality=least)
+        metrics.update(7, detection(boxes, [0.9, 0.8], [0.95, 0.85]))
+        found.append(metrics.compute())
+    assert [scores["segm_AP"] for scores in found] == pytest.approx([1.0, 51 / 101])
+    assert [scores["box_AP"] for scores in found] == pytest.approx([1.0, 51 / 101])
+
+
 def test_a_detection_takes_one_object_and_the_better_score_goes_first() -> None:
     truth = truth_of(square(10, 10, 20))
     rows = [row_of(square(10, 10, 20), image_id=7, category_id=1, score=0.5)]
