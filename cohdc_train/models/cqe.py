@@ -3,16 +3,13 @@
 The paper feeds the true contour to the head; at inference there is none, so the truth enters through the target only.
 """
 
-import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812 torch's own name for it
 from torch import Tensor, nn
-from torchvision.ops import roi_align
 
 Fusion = Literal["concat", "multiply", "add"]
-Goal = Literal["iou", "ciou"]
 
 
 class CQEHead(nn.Module):
@@ -21,8 +18,9 @@ class CQEHead(nn.Module):
     How the two meet:
     - "concat": the mask, max-pooled to the feature's size, is one more channel (Mask Scoring R-CNN);
     - "multiply": the feature is multiplied by the max-pooled mask (paper, Fig. 5, first structure);
-    - "add": the mask, not pooled, is added to the feature enlarged to the mask's size (Fig. 5, second structure; the
-      paper's larger RoI feature is the same one, interpolated), and the first convolution halves it again.
+    - "add": the mask is added to the feature enlarged to twice its size (Fig. 5, second structure; the paper's larger
+      RoI feature is the same one, interpolated), and the first convolution halves it again. A 28 x 28 mask is not
+      pooled, a larger one to 28 x 28.
 
     Args:
         in_channels: channels of the RoI feature.
@@ -61,7 +59,10 @@ class CQEHead(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
-        """features: [K, C, 14, 14]; masks: [K, 28, 28] probabilities of one class. Returns [K, num_classes], linear."""
+        """features: [K, C, 14, 14]; masks: [K, M, M] probabilities of one class, M a multiple of 28.
+
+        Returns [K, num_classes], linear.
+        """
         quality: Tensor = self.quality(self.fcs(self.convs(self.fuse(features, masks)).flatten(1)))
         return quality
 
@@ -69,76 +70,10 @@ class CQEHead(nn.Module):
         """What the convolutions see: [K, C + 1, 14, 14], [K, C, 14, 14] or [K, C, 28, 28], as `fusion` says."""
         scale = masks.shape[-1] // features.shape[-1]
         if self.fusion == "add":
-            return F.interpolate(features, scale_factor=float(scale), mode="bilinear") + masks[:, None]
+            larger = F.interpolate(features, scale_factor=2.0, mode="bilinear")
+            return larger + F.max_pool2d(masks[:, None], kernel_size=scale // 2)
         pooled = F.max_pool2d(masks[:, None], kernel_size=scale)
         return features * pooled if self.fusion == "multiply" else torch.cat([features, pooled], dim=1)
-
-
-@torch.no_grad()
-def cqe_targets(masks: Tensor, boxes: Tensor, gt_masks: Tensor, matched: Tensor, kind: Goal = "iou") -> Tensor:
-    """How well each predicted mask covers its whole ground-truth mask, also what of it lies outside the box.
-
-    masks: [K, M, M] probabilities; boxes: [K, 4] xyxy, px; gt_masks: [G, H, W] of 0 and 1; matched: [K] index into G.
-    Returns [K] in 0..1: the IoU for "iou"; for "ciou" (1 + CIoU) / 2 clipped, the paper's S_iou, and 0 where the masks
-    do not meet. Counted on the box's M x M grid, in whose cells the whole object's area is expressed too.
-    """
-    side = masks.shape[-1]
-    truth = gt_masks.to(boxes.dtype)
-    rois = torch.cat([matched[:, None].to(boxes.dtype), boxes], dim=1)
-    covered = roi_align(truth[:, None], rois, (side, side), sampling_ratio=2, aligned=True)[:, 0]
-    inside = (covered >= 0.5).to(boxes.dtype)
-    predicted = (masks > 0.5).to(boxes.dtype)
-    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    whole = truth.sum(dim=(1, 2))[matched] * side**2 / area.clamp(min=1.0)
-    intersection = (predicted * inside).sum(dim=(1, 2))
-    union = predicted.sum(dim=(1, 2)) + whole - intersection
-    iou: Tensor = (intersection / union.clamp(min=1e-6)).clamp(0.0, 1.0)
-    if kind == "iou" or not len(masks):
-        return iou
-    cell = (boxes[:, 2:] - boxes[:, :2]) / side
-    shape = Shape.of(predicted).placed(cell, boxes[:, :2])
-    return torch.where(iou > 0, 0.5 * (1 + ciou(iou, shape, Shape.of(truth).chosen(matched))).clamp(0.0, 2.0), 0.0)
-
-
-class Shape(NamedTuple):
-    """centre: [K, 2] centroid x, y; low, high: [K, 2] the corners of the tight box."""
-
-    centre: Tensor
-    low: Tensor
-    high: Tensor
-
-    @classmethod
-    def of(cls, masks: Tensor) -> "Shape":
-        """The shapes of masks [K, H, W] of 0 and 1, in cells; an empty mask's is all zeros."""
-        centre, low, high = [], [], []
-        for line in (masks.sum(dim=1), masks.sum(dim=2)):  # cells per column, per row
-            place = torch.arange(line.shape[1], device=line.device, dtype=line.dtype)
-            centre.append((line * (place + 0.5)).sum(dim=1) / line.sum(dim=1).clamp(min=1))
-            hit = line > 0
-            low.append(torch.where(hit, place, float(line.shape[1])).amin(dim=1) * hit.any(dim=1))
-            high.append(torch.where(hit, place + 1, 0.0).amax(dim=1))
-        return cls(torch.stack(centre, 1), torch.stack(low, 1), torch.stack(high, 1))
-
-    def placed(self, cell: Tensor, origin: Tensor) -> "Shape":
-        """In px: cell, origin: [K, 2] a cell's width and height and the grid's corner."""
-        return Shape(*(part * cell + origin for part in self))
-
-    def chosen(self, index: Tensor) -> "Shape":
-        """The shapes at `index` [N]."""
-        return Shape(*(part[index] for part in self))
-
-
-def ciou(iou: Tensor, a: Shape, b: Shape) -> Tensor:
-    """Complete IoU of masks: IoU - rho^2 / c^2 - alpha v (Zheng et al. 2020, with the masks' centroids).
-
-    rho: distance of the centroids; c: diagonal of the smallest box around both; v: how far the aspect ratios of their
-    tight boxes differ, alpha = v / (1 - IoU + v). iou: [K]. Returns [K], above -1.5 and at most 1.
-    """
-    distance = (a.centre - b.centre).square().sum(dim=1)
-    around = (torch.maximum(a.high, b.high) - torch.minimum(a.low, b.low)).square().sum(dim=1)
-    angles = [torch.atan2(*(s.high - s.low).unbind(dim=1)) for s in (a, b)]
-    v = 4 / math.pi**2 * (angles[0] - angles[1]).square()
-    return iou - distance / around.clamp(min=1e-6) - v * v / (1 - iou + v).clamp(min=1e-6)
 
 
 def cqe_loss(quality: Tensor, labels: Tensor, targets: Tensor) -> Tensor:

@@ -51,7 +51,7 @@ def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
     """Detections of images of any sizes, each in its own pixels.
 
     images: uint8 [3, H, W] RGB. Returns per image `boxes` [n, 4] xyxy px, `labels` [n] 0-based, `scores` [n],
-    `quality` [n], `masks` [n, 28, 28] probabilities inside the box. The network should be in evaluation mode.
+    `quality` [n], `masks` [n, M, M] probabilities inside the box. The network should be in evaluation mode.
     """
     rows, columns = network.config.canvas
     fitted = [letterbox(image.permute(1, 2, 0)[None], rows, columns) for image in images]

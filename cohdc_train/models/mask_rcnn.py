@@ -13,14 +13,17 @@ from torch import Tensor, nn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
 from torchvision.models.detection.image_list import ImageList
-from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
-from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss, maskrcnn_loss
+from torchvision.models.detection.mask_rcnn import MaskRCNNHeads
+from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss
 from torchvision.models.detection.rpn import RegionProposalNetwork, RPNHead
 from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
 from cohdc_train.models.backbones import Depth, HDCResNet, load_backbone_weights
-from cohdc_train.models.cqe import CQEHead, Fusion, Goal, cqe_loss, cqe_targets
+from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss
+from cohdc_train.models.cqe_targets import Goal, band_of, cqe_targets
+from cohdc_train.models.mask_head import MaskSize, mask_loss, mask_predictor
+from cohdc_train.models.true_masks import TrueMasks
 
 Target = dict[str, Any]
 ROI_LEVELS = ("0", "1", "2", "3")
@@ -46,7 +49,9 @@ class NetworkConfig:
         fc: width of the box and CQE heads' fully connected layers.
         cqe: how the CQE head joins feature and mask ("concat", "multiply", "add"); "off" leaves the head out, and
             quality is then 1.
-        cqe_target: what the CQE head regresses: mask IoU ("iou") or (1 + CIoU) / 2 ("ciou", the paper's S_iou).
+        cqe_target: what the CQE head regresses: mask IoU ("iou"), (1 + CIoU) / 2 ("ciou", the paper's S_iou),
+            Boundary IoU ("boundary_iou"), or the smaller of it and mask IoU ("min").
+        mask_size: side of the predicted masks, cells: 28, or 56 by one more deconvolution.
         proposals: proposals kept per image in training and at inference.
         rois: proposals per image that train the box head, a quarter of them positive.
         detections: rows of the padded output.
@@ -66,6 +71,7 @@ class NetworkConfig:
     fc: int = 1024
     cqe: Fusion | Literal["off"] = "concat"
     cqe_target: Goal = "iou"
+    mask_size: MaskSize = 28
     proposals: tuple[int, int] = (1000, 300)
     rois: int = 256
     detections: int = 100
@@ -151,7 +157,8 @@ class MaskRCNN(nn.Module):
         """The scalar losses of one batch; their sum trains the network.
 
         images: float [B, 3, H, W] in 0..1 on the canvas; targets: per image `boxes` [n, 4] xyxy px, `labels` [n] from
-        1, `masks` uint8 [n, H, W], and `ignore` [k, 4], the crowd's boxes. n may be 0.
+        1, `masks` [n, H, W] of 0 and 1 (or mini-masks [n, h, w] with their `frames`, see TrueMasks), and `ignore`
+        [k, 4], the crowd's boxes. n may be 0. `size`: (height, width) of what is no padding, the canvas' when missing.
         """
         features = self.features(images)
         sizes = [(int(images.shape[-2]), int(images.shape[-1]))] * len(targets)
@@ -206,20 +213,23 @@ class MaskRCNN(nn.Module):
         logits = heads.mask_predictor(heads.mask_head(pooled)).float()
         # The losses turn masks into float32: only those of the sampled objects, however many the image has.
         used = [torch.unique(m, return_inverse=True) for m in matches]
+        truths = [TrueMasks.of(t, chosen) for t, (chosen, _) in zip(targets, used, strict=True)]
         matches = [place for _, place in used]
-        gt_masks = [t["masks"][chosen] for t, (chosen, _) in zip(targets, used, strict=True)]
-        gt_labels = [t["labels"][chosen] for t, (chosen, _) in zip(targets, used, strict=True)]
-        losses = {"mask": maskrcnn_loss(logits, boxes, gt_masks, gt_labels, matches)}
+        classes = torch.cat([label[p] for label, p in zip(labels, positive, strict=True)])
+        chosen_logits = logits[torch.arange(len(classes), device=classes.device), classes]
+        per_image = list(zip(truths, [b.float() for b in boxes], matches, strict=True))
+        losses = {"mask": mask_loss(chosen_logits, per_image)}
         if self.cqe is None:
             return losses
-        classes = torch.cat([label[p] for label, p in zip(labels, positive, strict=True)]) - 1
-        rows = torch.arange(len(classes), device=classes.device)
-        probabilities = logits[rows, classes + 1].sigmoid()
+        probabilities = chosen_logits.sigmoid()
         quality = self.cqe(pooled, probabilities.to(pooled.dtype))
-        per_image = zip(probabilities.split([len(b) for b in boxes]), boxes, gt_masks, matches, strict=True)
-        goal = self.config.cqe_target
-        truth = [cqe_targets(p, b.float(), g, m, goal) if len(b) else b.new_zeros(0) for p, b, g, m in per_image]
-        losses["cqe"] = cqe_loss(quality, classes, torch.cat(truth))
+        goals = [
+            cqe_targets(p, b, truth, m, self.config.cqe_target, band_of(*target.get("size", sizes[0])))
+            for p, (truth, b, m), target in zip(
+                probabilities.split([len(b) for b in boxes]), per_image, targets, strict=True
+            )
+        ]
+        losses["cqe"] = cqe_loss(quality, classes - 1, torch.cat(goals))
         return losses
 
 
@@ -261,5 +271,5 @@ def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:
         detections_per_img=config.detections,
         mask_roi_pool=MultiScaleRoIAlign(list(ROI_LEVELS), 14, 2),
         mask_head=MaskRCNNHeads(channels, (channels,) * 4, 1),
-        mask_predictor=MaskRCNNPredictor(channels, channels, num_classes + 1),
+        mask_predictor=mask_predictor(channels, num_classes + 1, config.mask_size),
     )

@@ -120,12 +120,35 @@ def test_background_inside_a_crowd_is_no_negative(small_config):
 
 def test_the_target_of_the_quality_changes_its_loss_and_nothing_else(small_config):
     losses = []
-    for goal in ("iou", "ciou"):
+    for goal in ("iou", "ciou", "boundary_iou", "min"):
         torch.manual_seed(0)
         network = MaskRCNN(1, dataclasses.replace(small_config, cqe_target=goal))
         losses.append(network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])]))
-    assert losses[0]["cqe"].item() != losses[1]["cqe"].item()
-    assert losses[0]["mask"].item() == losses[1]["mask"].item()
+    iou, ciou, boundary, smaller = (loss["cqe"].item() for loss in losses)
+    assert len({iou, ciou, boundary}) == 3
+    assert smaller in (iou, boundary)
+    assert len({loss["mask"].item() for loss in losses}) == 1
+
+
+def test_masks_of_56_cells_train_and_are_given(small_config):
+    network = MaskRCNN(1, dataclasses.replace(small_config, mask_size=56, cqe="add"))
+    sum(network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])]).values()).backward()
+    assert network.roi_heads.mask_predictor.conv6_mask.weight.grad.abs().sum() > 0
+    found = detect(network.eval(), [torch.randint(0, 255, (3, 96, 128), dtype=torch.uint8)])[0]
+    assert found["masks"].shape[1:] == (56, 56)
+
+
+def test_mini_masks_give_the_losses_of_whole_ones(small_config):
+    corners = [[10, 10, 60, 70], [64, 20, 120, 90]]
+    whole = _target(corners)
+    mini = {**whole, "masks": torch.ones(2, 28, 28), "frames": whole["boxes"]}
+    losses = []
+    for target in (whole, mini):
+        torch.manual_seed(0)
+        network = MaskRCNN(1, small_config)
+        losses.append(network.losses(torch.rand(1, 3, 96, 128), [target]))
+    for name, loss in losses[0].items():
+        assert loss.item() == pytest.approx(losses[1][name].item(), rel=0.02)
 
 
 def test_cqe_can_be_left_out(small_config):
