@@ -10,22 +10,15 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
-from torch.utils.data import ConcatDataset, DataLoader, Dataset
-from torchvision import tv_tensors
+from torch.utils.data import DataLoader, Dataset
 
 from cohdc_train.data import image_files
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder
 from cohdc_train.data.layout import CocoPaths
-from cohdc_train.data.transforms import (
-    Augmentation,
-    TrainingTransform,
-    blank_padding,
-    mask_boxes,
-    photometric_augmentation,
-)
+from cohdc_train.data.train_set import CocoTrainSet, Target
+from cohdc_train.data.transforms import Augmentation, blank_padding, photometric_augmentation
 
-Target = dict[str, Any]
 ValSample = tuple[Tensor, int]
 _AUGMENTATION = Augmentation()
 
@@ -51,39 +44,12 @@ class TrainBatch(NamedTuple):
 
     images: [B, 3, H, W] on the canvas; uint8 from the loader, float32 in 0..1 after the transfer to the device.
     targets: per image `boxes` [n, 4] xyxy px, `labels` int64 [n] from 1, `masks` uint8 [n, H, W], `ignore` [k, 4] the
-    crowd's boxes, `image_id`, and `size`: (height, width) of the content on the canvas; the rest is padding.
+    crowd's boxes, `image_id`, and `size`: (height, width) of the content on the canvas; the rest is padding. With
+    mini-masks `masks` are float16 [n, h, w] on `frames` [n, 4], the boxes.
     """
 
     images: Tensor
     targets: list[Target]
-
-
-class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
-    """Augmented training images on the canvas, with boxes recomputed from what is left of the masks."""
-
-    def __init__(self, split: CocoSplit, canvas: tuple[int, int], augment: Augmentation) -> None:
-        self.split = split
-        self.transform = TrainingTransform(canvas, augment)
-
-    def __len__(self) -> int:
-        return len(self.split.images)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Target]:
-        """uint8 [3, H, W] and its target. Raises DataError naming an image that cannot be read."""
-        image = self.split.images[index]
-        size = (image.height, image.width)
-        objects = [o for o in image.objects if not o.crowd]
-        crowd = torch.tensor([o.box for o in image.objects if o.crowd], dtype=torch.float32).reshape(-1, 4)
-        crowd[:, 2:] += crowd[:, :2]
-        masks = (torch.from_numpy(o.mask(*size)) for o in objects)
-        sample = {
-            "image": tv_tensors.Image(torch.from_numpy(read_image(image)).permute(2, 0, 1)),
-            "content": tv_tensors.Mask(torch.ones((1, *size), dtype=torch.uint8)),
-            "ignore": tv_tensors.BoundingBoxes(crowd, format="XYXY", canvas_size=size),
-        }
-        labels = torch.tensor([o.label for o in objects], dtype=torch.int64)
-        out = {name: value.as_subclass(Tensor) for name, value in self.transform(sample, masks).items()}
-        return out["image"], _target(out, labels, image.id)
 
 
 class CocoValSet(Dataset[ValSample]):
@@ -114,6 +80,8 @@ class CocoDataModule(pl.LightningDataModule):
         batch_size: images per batch and device.
         workers: processes that read images; 0 reads them in the trainer's own.
         augment: what training images go through.
+        mini_mask: (height, width) in cells at which each training mask is kept, on its box: less memory for many
+            objects, softer contours for large ones. None keeps whole masks.
         subset: how many images of each split to use.
         paths: annotation files and image folders, where the layout is an unusual one.
 
@@ -129,6 +97,7 @@ class CocoDataModule(pl.LightningDataModule):
         batch_size: int = 2,
         workers: int = 1,
         augment: Augmentation = _AUGMENTATION,
+        mini_mask: tuple[int, int] | None = None,
         subset: Subset = _EVERYTHING,
         paths: CocoPaths | None = None,
     ) -> None:
@@ -139,10 +108,11 @@ class CocoDataModule(pl.LightningDataModule):
         self.batch_size = batch_size
         self.workers = workers
         self.augment = augment
+        self.mini_mask = mini_mask
         self.subset = subset
         self.paths = paths
         self._folder: CocoFolder | None = None
-        self._photometric = photometric_augmentation() if augment.photometric else None
+        self._photometric = photometric_augmentation(augment)
 
     @property
     def folder(self) -> CocoFolder:
@@ -181,8 +151,9 @@ class CocoDataModule(pl.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled batches of `TrainBatch`; the order and every draw follow torch's seed."""
-        sets = [CocoTrainSet(split, self.canvas, self.augment) for split in self.folder.train]
-        return self._loader(ConcatDataset(sets), shuffle=True, collate=_collate_train)
+        images = [image for split in self.folder.train for image in split.images]
+        training = CocoTrainSet(images, self.canvas, self.augment, self.mini_mask)
+        return self._loader(training, shuffle=True, collate=_collate_train)
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Batches [(image uint8 [3, height, width], image id), ...]."""
@@ -210,23 +181,6 @@ class CocoDataModule(pl.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.workers > 0,
         )
-
-
-def _target(out: dict[str, Tensor], labels: Tensor, image_id: int) -> Target:
-    """What is left after the transform: objects with a visible pixel, crowd boxes with an area."""
-    boxes = mask_boxes(out["masks"])
-    kept = boxes[:, 2] > boxes[:, 0]
-    ignore = out["ignore"]
-    ignore = ignore[(ignore[:, 2] > ignore[:, 0]) & (ignore[:, 3] > ignore[:, 1])]
-    content = mask_boxes(out["content"])[0]
-    return {
-        "boxes": boxes[kept],
-        "labels": labels[kept],
-        "masks": out["masks"][kept],
-        "ignore": ignore,
-        "image_id": image_id,
-        "size": (int(content[3]), int(content[2])),
-    }
 
 
 def _collate_train(samples: Sequence[tuple[Tensor, Target]]) -> TrainBatch:

@@ -1,22 +1,24 @@
 """Training geometry on the CPU (torchvision.transforms.v2) and photometry on the device (kornia)."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from kornia.augmentation import (
     AugmentationSequential,
     ColorJiggle,
+    IntensityAugmentationBase2D,
+    RandomGamma,
     RandomGaussianBlur,
     RandomGaussianNoise,
+    RandomJPEG,
+    RandomLinearIllumination,
+    RandomMotionBlur,
     RandomPlanckianJitter,
 )
 from torch import Tensor
 from torchvision import tv_tensors
-from torchvision.transforms import v2
-from torchvision.transforms.v2.functional import get_size, pad, resized_crop
+from torchvision.transforms.v2 import functional as F2  # noqa: N812
 
 
 @dataclass(frozen=True)
@@ -25,90 +27,88 @@ class Augmentation:
 
     Attributes:
         flip: probability of a horizontal flip.
-        scale_jitter: smallest and largest scale, relative to the one at which the image just fits into the canvas.
+        scale_jitter: smallest and largest scale, relative to the one at which the image just fits into the canvas;
+            drawn per image, it is the multi-scale training.
+        copy_paste: probability that objects of another training image are pasted over this one.
         photometric: vary brightness, contrast, colour temperature, noise and blur on the device.
+        degrade: probability of each fault that a moving camera's image has: gamma, light that changes across it
+            (a rolling shutter's exposure), motion blur, noise and JPEG.
     """
 
     flip: float = 0.5
     scale_jitter: tuple[float, float] = (0.5, 1.5)
+    copy_paste: float = 0.0
     photometric: bool = True
+    degrade: float = 0.0
 
     def __post_init__(self) -> None:
         low, high = self.scale_jitter
         if not 0 < low <= high:
             raise ValueError(f"scale_jitter {self.scale_jitter}: needs 0 < smallest <= largest")
+        for name in ("flip", "copy_paste", "degrade"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} {getattr(self, name)}: a probability is in 0..1")
 
 
-class JitteredCrop(v2.Transform):  # type: ignore[misc]  # torchvision is not typed
-    """Scale an image at random and, where it is larger than the canvas, keep a random window of the canvas' size.
+@dataclass(frozen=True)
+class Placement:
+    """Where an image lands on the canvas: a window of it, scaled into the top left, perhaps mirrored; zeros elsewhere.
 
     The window is cut before it is resized, so that no pixel is computed that would be thrown away. Images are resized
     bilinearly with antialiasing; masks take the nearest pixel, centre to centre (v2's own rule for masks is half a
     pixel off).
+
+    Attributes:
+        top: first row of the window, image px, and so on.
+        left: first column.
+        height: rows of the window.
+        width: columns of the window.
+        size: (height, width) in px of the content on the canvas.
+        canvas: (height, width) in px.
+        mirrored: left and right are swapped.
     """
 
-    def __init__(self, canvas: tuple[int, int], jitter: tuple[float, float]) -> None:
-        super().__init__()
-        self.canvas = canvas
-        self.jitter = jitter
+    top: int
+    left: int
+    height: int
+    width: int
+    size: tuple[int, int]
+    canvas: tuple[int, int]
+    mirrored: bool
 
-    def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
-        """The window (top, left, height, width in image px) and its size on the canvas."""
-        height, width = get_size(next(x for x in flat_inputs if isinstance(x, tv_tensors.Image)))
-        scale = min(self.canvas[0] / height, self.canvas[1] / width) * float(torch.empty(()).uniform_(*self.jitter))
-        rows, columns = (max(1, min(n, round(c / scale))) for n, c in zip((height, width), self.canvas, strict=True))
-        size = [max(1, min(c, round(n * scale))) for n, c in zip((rows, columns), self.canvas, strict=True)]
-        top, left = int(torch.randint(height - rows + 1, ())), int(torch.randint(width - columns + 1, ()))
-        return {"top": top, "left": left, "height": rows, "width": columns, "size": size}
+    @classmethod
+    def draw(cls, image: tuple[int, int], canvas: tuple[int, int], augment: Augmentation) -> "Placement":
+        """A random one for an image of (height, width) px."""
+        jitter = float(torch.empty(()).uniform_(*augment.scale_jitter))
+        scale = min(c / n for n, c in zip(image, canvas, strict=True)) * jitter
+        rows, columns = (max(1, min(n, round(c / scale))) for n, c in zip(image, canvas, strict=True))
+        size = [max(1, min(c, round(n * scale))) for n, c in zip((rows, columns), canvas, strict=True)]
+        top, left = int(torch.randint(image[0] - rows + 1, ())), int(torch.randint(image[1] - columns + 1, ()))
+        mirrored = bool(torch.rand(()) < augment.flip)
+        return cls(top, left, rows, columns, (size[0], size[1]), canvas, mirrored)
 
-    def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
-        """One image, mask or box tensor through the window."""
-        if not isinstance(inpt, tv_tensors.Mask):
-            return resized_crop(inpt, **params, antialias=True)
-        bottom, right = params["top"] + params["height"], params["left"] + params["width"]
-        window = inpt.as_subclass(Tensor)[:, params["top"] : bottom, params["left"] : right]
-        return tv_tensors.Mask(F.interpolate(window[None], params["size"], mode="nearest-exact")[0])
+    def image(self, pixels: Tensor) -> Tensor:
+        """uint8 [3, H, W] -> uint8 [3, *canvas]."""
+        window = (self.top, self.left, self.height, self.width)
+        return self._finish(F2.resized_crop(pixels, *window, list(self.size), antialias=True))
 
+    def mask(self, mask: Tensor) -> Tensor:
+        """uint8 [H, W] of 0 and 1 -> [*canvas]."""
+        window = mask[self.top : self.top + self.height, self.left : self.left + self.width]
+        return self._finish(F.interpolate(window[None, None], self.size, mode="nearest-exact")[0, 0])
 
-class PadToCanvas(v2.Transform):  # type: ignore[misc]
-    """Zeros at the right and at the bottom up to the canvas."""
+    def boxes(self, boxes: Tensor) -> Tensor:
+        """float32 [n, 4] xyxy, px -> the same on the canvas, clipped to the content; those outside have no extent."""
+        image_size = (self.top + self.height, self.left + self.width)
+        moved = tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=image_size)
+        moved = F2.resized_crop(moved, self.top, self.left, self.height, self.width, list(self.size))
+        moved = F2.horizontal_flip(moved) if self.mirrored else moved
+        clipped: Tensor = F2.clamp_bounding_boxes(moved).as_subclass(Tensor)
+        return clipped
 
-    def __init__(self, canvas: tuple[int, int]) -> None:
-        super().__init__()
-        self.canvas = canvas
-
-    def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
-        """The padding: left, top, right, bottom."""
-        height, width = get_size(next(x for x in flat_inputs if isinstance(x, tv_tensors.Image)))
-        return {"padding": [0, 0, self.canvas[1] - width, self.canvas[0] - height]}
-
-    def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
-        """One image, mask or box tensor, padded."""
-        return pad(inpt, **params)
-
-
-class TrainingTransform:
-    """Scale jitter with crop, horizontal flip, padding to the canvas; boxes are clamped to what is left of them."""
-
-    def __init__(self, canvas: tuple[int, int], augment: Augmentation) -> None:
-        self._crop = JitteredCrop(canvas, augment.scale_jitter)
-        self._rest = v2.Compose(
-            [v2.RandomHorizontalFlip(augment.flip), v2.ClampBoundingBoxes(), PadToCanvas(canvas)],
-        )
-
-    def __call__(self, sample: dict[str, Any], masks: Iterable[Tensor]) -> dict[str, Any]:
-        """A sample on the canvas, with `masks` [n, H, W] in it.
-
-        sample: an `image` and whatever boxes and masks belong to it; masks: of the image's size, [height, width] each,
-        taken one at a time, so that however many objects a large image has, one mask of its size is in memory.
-        """
-        params = self._crop.make_params([sample["image"]])
-        out = {name: self._crop.transform(value, params) for name, value in sample.items()}
-        cut = [self._crop.transform(tv_tensors.Mask(mask[None]), params) for mask in masks]
-        none = tv_tensors.Mask(torch.zeros((0, *params["size"]), dtype=torch.uint8))
-        out["masks"] = tv_tensors.Mask(torch.cat(cut)) if cut else none
-        result: dict[str, Any] = self._rest(out)
-        return result
+    def _finish(self, content: Tensor) -> Tensor:
+        flipped = content.flip(-1) if self.mirrored else content
+        return F.pad(flipped, (0, self.canvas[1] - self.size[1], 0, self.canvas[0] - self.size[0]))
 
 
 def mask_boxes(masks: Tensor) -> Tensor:
@@ -123,18 +123,29 @@ def mask_boxes(masks: Tensor) -> Tensor:
     return torch.stack([x0, y0, x1, y1], dim=1).float()
 
 
-def photometric_augmentation() -> AugmentationSequential:
-    """Colour, noise and blur for float images [B, 3, H, W] in 0..1, drawn per image.
+def photometric_augmentation(augment: Augmentation) -> AugmentationSequential | None:
+    """Colour, noise, blur and a camera's faults for float images [B, 3, H, W] in 0..1, drawn per image; None for none.
 
     Colour varies by the temperature of the light: hue and saturation, through HSV, cost five times as much as the rest.
     """
-    return AugmentationSequential(
-        ColorJiggle(brightness=(0.6, 1.4), contrast=(0.7, 1.3), p=0.8),
-        RandomPlanckianJitter(p=0.3),
-        RandomGaussianNoise(std=0.02, p=0.2),
-        RandomGaussianBlur((3, 3), (0.3, 1.0), p=0.1),
-        data_keys=["input"],
-    )
+    steps: list[IntensityAugmentationBase2D] = []
+    if augment.photometric:
+        steps += [
+            ColorJiggle(brightness=(0.6, 1.4), contrast=(0.7, 1.3), p=0.8),
+            RandomPlanckianJitter(p=0.3),
+            RandomGaussianNoise(std=0.02, p=0.2),
+            RandomGaussianBlur((3, 3), (0.3, 1.0), p=0.1),
+        ]
+    if augment.degrade > 0:
+        p = augment.degrade
+        steps += [
+            RandomGamma((0.6, 1.7), p=p),
+            RandomLinearIllumination(gain=(0.05, 0.3), p=p),
+            RandomMotionBlur((3, 11), angle=180.0, direction=0.0, border_type="replicate", p=p),
+            RandomGaussianNoise(std=0.05, p=p),
+            RandomJPEG((20.0, 80.0), p=p),
+        ]
+    return AugmentationSequential(*steps, data_keys=["input"]) if steps else None
 
 
 def blank_padding(images: Tensor, sizes: list[tuple[int, int]]) -> Tensor:

@@ -7,12 +7,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchvision import tv_tensors
+from torch import Tensor
 
 from cohdc_train.data.transforms import (
     Augmentation,
-    JitteredCrop,
-    TrainingTransform,
+    Placement,
     blank_padding,
     mask_boxes,
     photometric_augmentation,
@@ -21,26 +20,11 @@ from cohdc_train.data.transforms import (
 sides = st.integers(20, 120)
 
 
-def sample(height: int, width: int, crowd: bool = True) -> dict[str, torch.Tensor]:
-    """A picture whose red channel is 255 exactly under the mask."""
-    mask = torch.zeros((1, height, width), dtype=torch.uint8)
-    left, top, right, bottom = width // 5, height // 4, width // 2, height // 2
-    mask[0, top:bottom, left:right] = 1
-    box = [[left, top, right, bottom]] if crowd else []
-    return {
-        "image": tv_tensors.Image(torch.cat([mask * 255, mask * 0 + 40, mask * 0 + 80])),
-        "masks": tv_tensors.Mask(mask),
-        "ignore": tv_tensors.BoundingBoxes(
-            torch.tensor(box, dtype=torch.float32).reshape(-1, 4), format="XYXY", canvas_size=(height, width)
-        ),
-    }
-
-
-def transformed(
-    sample: dict[str, torch.Tensor], canvas: tuple[int, int], augment: Augmentation
-) -> dict[str, torch.Tensor]:
-    """The sample through the training's transform, its masks one by one."""
-    return TrainingTransform(canvas, augment)(sample, list(sample.pop("masks").as_subclass(torch.Tensor)))
+def picture(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A picture whose red channel is 255 exactly under the mask, and the mask."""
+    mask = torch.zeros((height, width), dtype=torch.uint8)
+    mask[height // 4 : height // 2, width // 5 : width // 2] = 1
+    return torch.stack([mask * 255, mask * 0 + 40, mask * 0 + 80]), mask
 
 
 @settings(max_examples=60, deadline=None)
@@ -49,11 +33,13 @@ def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     height: int, width: int, rows: int, columns: int, seed: int, flip: bool
 ) -> None:
     torch.manual_seed(seed)
-    out = transformed(sample(height, width), (rows, columns), Augmentation(flip=float(flip)))
-    assert out["image"].shape == (3, rows, columns)
-    assert out["masks"].shape == (1, rows, columns)
-    red = out["image"][0].float() > 127
-    mask = out["masks"][0] > 0
+    pixels, whole = picture(height, width)
+    placement = Placement.draw((height, width), (rows, columns), Augmentation(flip=float(flip)))
+    assert placement.mirrored == flip
+    image, mask = placement.image(pixels), placement.mask(whole) > 0
+    assert image.shape == (3, rows, columns)
+    assert mask.shape == (rows, columns)
+    red = image[0].float() > 127
     if mask.sum() < 9:
         return
     edge = mask.float()[None, None]
@@ -63,7 +49,7 @@ def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     near = torch.nn.functional.max_pool2d(edge, 3, 1, 1)[0, 0] > 0
     assert not (inside & ~red).any()
     assert not (red & ~near).any()
-    box, crowd = mask_boxes(out["masks"])[0], out["ignore"][0]
+    box, crowd = mask_boxes(mask[None])[0], placement.boxes(mask_boxes(whole[None]))[0]
     assert torch.allclose(box, crowd, atol=1.0)
     left, top, right, bottom = (int(v) for v in box)
     assert mask[top:bottom, left:right].any(dim=0).all()
@@ -82,30 +68,23 @@ def test_mask_boxes_are_the_extents(height: int, width: int, seed: int) -> None:
 
 
 def test_without_jitter_the_image_fits_and_the_rest_is_zero() -> None:
-    out = transformed(sample(40, 40), (60, 100), Augmentation(0.0, (1.0, 1.0)))
-    assert (out["image"][1, :, :60] == 40).all()
-    assert (out["image"][:, :, 60:] == 0).all()
-    assert mask_boxes(out["masks"]).tolist() == [[12, 15, 30, 30]]
+    pixels, mask = picture(40, 40)
+    placement = Placement.draw((40, 40), (60, 100), Augmentation(0.0, (1.0, 1.0)))
+    image = placement.image(pixels)
+    assert placement.size == (60, 60)
+    assert (image[1, :, :60] == 40).all()
+    assert (image[:, :, 60:] == 0).all()
+    assert mask_boxes(placement.mask(mask)[None]).tolist() == [[12, 15, 30, 30]]
 
 
 def test_the_jitter_covers_its_range() -> None:
-    crop = JitteredCrop((60, 60), (0.5, 1.5))
     torch.manual_seed(0)
-    picture = [tv_tensors.Image(torch.zeros(3, 60, 60, dtype=torch.uint8))]
-    params = [crop.make_params(picture) for _ in range(300)]
-    scales = [p["size"][0] / p["height"] for p in params]
+    placements = [Placement.draw((60, 60), (60, 60), Augmentation(0.5, (0.5, 1.5))) for _ in range(300)]
+    scales = [p.size[0] / p.height for p in placements]
     assert 0.5 <= min(scales) < 0.53
     assert 1.47 < max(scales) <= 1.51
-    assert len({(p["top"], p["left"]) for p in params}) > 50
-
-
-def test_no_objects_is_no_trouble() -> None:
-    empty = sample(30, 40, crowd=False)
-    empty["masks"] = tv_tensors.Mask(empty["masks"][:0])
-    out = transformed(empty, (50, 50), Augmentation())
-    assert out["masks"].shape == (0, 50, 50)
-    assert out["ignore"].shape == (0, 4)
-    assert mask_boxes(out["masks"]).shape == (0, 4)
+    assert len({(p.top, p.left) for p in placements}) > 50
+    assert 100 < sum(p.mirrored for p in placements) < 200
 
 
 @pytest.mark.parametrize("jitter", [(0.0, 1.0), (1.5, 0.5)])
@@ -114,10 +93,17 @@ def test_a_senseless_jitter_is_refused(jitter: tuple[float, float]) -> None:
         Augmentation(scale_jitter=jitter)
 
 
+def test_a_probability_above_one_is_refused() -> None:
+    with pytest.raises(ValueError, match="copy_paste 2"):
+        Augmentation(copy_paste=2)
+
+
 def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> None:
     torch.manual_seed(0)
     images = torch.full((4, 3, 32, 40), 0.5)
-    out = photometric_augmentation()(images.clone())
+    photometry = photometric_augmentation(Augmentation())
+    assert photometry is not None
+    out = photometry(images.clone())
     assert out.shape == images.shape
     assert len({round(float(image.mean()), 4) for image in out}) > 2
     blank = blank_padding(out, [(20, 40), (32, 30), (32, 40), (1, 1)])
@@ -125,3 +111,25 @@ def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> No
     assert (blank[1, :, :, 30:] == 0).all()
     assert (blank[2] != 0).any()
     assert (blank[3, :, 1:, 1:] == 0).all()
+
+
+def test_a_moving_cameras_faults_leave_an_image_in_its_range() -> None:
+    """Every fault at once, on stripes: the image is another one, blurred and darker or lighter, and still an image."""
+    torch.manual_seed(0)
+    faults = photometric_augmentation(Augmentation(photometric=False, degrade=1.0))
+    assert faults is not None
+    stripes = (torch.arange(64) // 4 % 2).float().expand(4, 3, 48, 64).clone()
+    out = faults(stripes.clone()).clamp(0, 1)
+    assert out.shape == stripes.shape
+    assert torch.isfinite(out).all()
+    assert ((out - stripes).abs().mean(dim=(1, 2, 3)) > 0.02).all()
+    contrast = [
+        float(image[:, bars > 0].mean() - image[:, bars == 0].mean())
+        for image, bars in zip(out, stripes[:, 0], strict=True)
+    ]
+    assert all(0.1 < value < 0.98 for value in contrast)
+    assert len({round(value, 3) for value in contrast}) == 4
+
+
+def test_no_augmentation_is_none() -> None:
+    assert photometric_augmentation(Augmentation(photometric=False)) is None

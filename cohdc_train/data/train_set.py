@@ -1,0 +1,127 @@
+"""Training samples: images placed on the canvas, objects of others pasted over them, and what is left of the masks."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+from torchvision.ops import roi_align
+
+from cohdc_train.data.annotations import CocoImage, CocoObject, read_image
+from cohdc_train.data.transforms import Augmentation, Placement, mask_boxes
+
+Target = dict[str, Any]
+_PASTED = 8  # objects at most that one image gives to another
+_LEFT = 0.1  # share of an object that must still be seen behind what is pasted over it, or it is ignored
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """image: uint8 [3, H, W] on the canvas; size: of its content; ignore: [k, 4] xyxy px; objects: labels and masks
+    uint8 [H, W], made one at a time, so that however many a large image has, one mask of its size is in memory.
+    """
+
+    image: Tensor
+    size: tuple[int, int]
+    ignore: Tensor
+    objects: Iterable[tuple[int, Tensor]]
+
+
+class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
+    """Augmented training images on the canvas, with boxes recomputed from what is left of the masks.
+
+    images: of every root; canvas: (height, width) px; augment: what they go through; mini_mask: (height, width) in
+    cells that each mask is kept at, on its box, instead of on the canvas.
+    """
+
+    def __init__(
+        self,
+        images: Sequence[CocoImage],
+        canvas: tuple[int, int],
+        augment: Augmentation,
+        mini_mask: tuple[int, int] | None = None,
+    ) -> None:
+        self.images = images
+        self.canvas = canvas
+        self.augment = augment
+        self.mini_mask = mini_mask
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Target]:
+        """uint8 [3, H, W] and its target. Raises DataError naming an image that cannot be read."""
+        image = self.images[index]
+        scene = self._place(image, [o for o in image.objects if not o.crowd])
+        if self.augment.copy_paste > 0 and torch.rand(()) < self.augment.copy_paste:
+            scene = self._paste(self.images[int(torch.randint(len(self.images), ()))], scene)
+        return scene.image, self._target(scene, image.id)
+
+    def _place(self, image: CocoImage, objects: Sequence[CocoObject]) -> _Scene:
+        """An image and some of its objects on the canvas, as drawn."""
+        size = (image.height, image.width)
+        placement = Placement.draw(size, self.canvas, self.augment)
+        crowd = torch.tensor([o.box for o in image.objects if o.crowd], dtype=torch.float32).reshape(-1, 4)
+        crowd[:, 2:] += crowd[:, :2]
+        pixels = placement.image(torch.from_numpy(read_image(image)).permute(2, 0, 1))
+        masks = ((o.label, placement.mask(torch.from_numpy(o.mask(*size)))) for o in objects)
+        return _Scene(pixels, placement.size, placement.boxes(crowd), masks)
+
+    def _paste(self, giver: CocoImage, scene: _Scene) -> _Scene:
+        """Some objects of another image over the scene (Ghiasi et al. 2021, copy-paste)."""
+        whole = [o for o in giver.objects if not o.crowd]
+        order = torch.randperm(len(whole))[: int(torch.randint(1, _PASTED + 1, ()))]
+        given = self._place(giver, [whole[i] for i in order])
+        height, width = scene.size
+        objects = []
+        over = torch.zeros(self.canvas, dtype=torch.bool)
+        for label, mask in given.objects:
+            mask[height:], mask[:, width:] = 0, 0
+            objects.append((label, mask))
+            over |= mask > 0
+        hidden: list[Tensor] = []
+        behind = list(_behind(scene.objects, over, hidden))
+        ignore = torch.cat([scene.ignore, mask_boxes(torch.stack(hidden)) if hidden else scene.ignore[:0]])
+        image = torch.where(over, given.image, scene.image)
+        return replace(scene, image=image, ignore=ignore, objects=behind + objects)
+
+    def _target(self, scene: _Scene, image_id: int) -> Target:
+        """What is left of the scene: objects with a visible pixel, crowd boxes with an area."""
+        labels: list[int] = []
+        masks: list[Tensor] = [torch.zeros((0, *(self.mini_mask or self.canvas)), dtype=torch.uint8)]
+        boxes = [torch.zeros((0, 4))]
+        for label, mask in scene.objects:
+            box = mask_boxes(mask[None])
+            if box[0, 2] > box[0, 0]:
+                labels.append(label)
+                masks.append(mask[None] if self.mini_mask is None else _minimised(mask, box, self.mini_mask))
+                boxes.append(box)
+        ignore = scene.ignore
+        target = {
+            "boxes": torch.cat(boxes),
+            "labels": torch.tensor(labels, dtype=torch.int64),
+            "masks": torch.cat(masks),
+            "ignore": ignore[(ignore[:, 2] > ignore[:, 0]) & (ignore[:, 3] > ignore[:, 1])],
+            "image_id": image_id,
+            "size": scene.size,
+        }
+        return target if self.mini_mask is None else target | {"frames": target["boxes"]}
+
+
+def _behind(objects: Iterable[tuple[int, Tensor]], over: Tensor, hidden: list[Tensor]) -> Iterator[tuple[int, Tensor]]:
+    """What still shows of objects behind `over`; the rests of those that hardly do go to `hidden`."""
+    for label, mask in objects:
+        left = mask * ~over
+        if left.sum() >= _LEFT * mask.sum():
+            yield label, left
+        else:
+            hidden.append(left)
+
+
+def _minimised(mask: Tensor, box: Tensor, size: tuple[int, int]) -> Tensor:
+    """float16 [1, *size]: share of each cell of a grid over its box [1, 4] that a mask [H, W] covers."""
+    roi = torch.cat([torch.zeros(1, 1), box], dim=1)
+    covered: Tensor = roi_align(mask[None, None].float(), roi, size, sampling_ratio=-1, aligned=True)
+    return covered[0].half()
