@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import cv2
 import lightning.pytorch as pl
@@ -18,6 +18,7 @@ from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder
 from cohdc_train.data.layout import CocoPaths
 from cohdc_train.data.train_set import CocoTrainSet, Target
 from cohdc_train.data.transforms import Augmentation, blank_padding, photometric_augmentation
+from cohdc_train.errors import DataError
 
 ValSample = tuple[Tensor, int]
 _AUGMENTATION = Augmentation()
@@ -77,7 +78,7 @@ class CocoDataModule(pl.LightningDataModule):
         root: the folder, or several.
         classes: use these classes only; None uses all of them.
         canvas: (height, width) in px every training image is fitted into; the network takes it over.
-        batch_size: images per batch and device.
+        batch_size: images per batch and device; `cohdc fit` also takes "auto", the most that memory allows.
         workers: processes that read images; 0 reads them in the trainer's own.
         augment: what training images go through.
         mini_mask: (height, width) in cells at which each training mask is kept, on its box: less memory for many
@@ -94,7 +95,7 @@ class CocoDataModule(pl.LightningDataModule):
         root: list[Path] | Path | None = None,
         classes: list[str] | None = None,
         canvas: tuple[int, int] = (800, 1024),
-        batch_size: int = 2,
+        batch_size: int | Literal["auto"] = 2,
         workers: int = 1,
         augment: Augmentation = _AUGMENTATION,
         mini_mask: tuple[int, int] | None = None,
@@ -171,6 +172,8 @@ class CocoDataModule(pl.LightningDataModule):
         return TrainBatch(images, batch.targets)
 
     def _loader(self, dataset: Dataset[Any], shuffle: bool, collate: Any) -> DataLoader[Any]:
+        if self.batch_size == "auto":
+            raise DataError("batch_size auto: only `cohdc fit` can find it")
         return DataLoader(
             dataset,
             batch_size=self.batch_size,

@@ -17,6 +17,8 @@ from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
 from cohdc_train.presets import config_path
+from cohdc_train.train.batch_size import largest_batch
+from cohdc_train.train.ema import ema
 from cohdc_train.train.module import MaskRCNNModule
 
 _USAGE = "cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR] [--print_config] [--OPTION VALUE ...]"
@@ -110,6 +112,9 @@ class FitCommand(LightningCLI):
         """`--out`, `--ckpt_path`, the checkpoints, and what the network takes over from the data."""
         parser.add_argument("--out", type=Path, default=Path("runs/fit"), help="folder for everything that is written")
         parser.add_argument("--ckpt_path", type=Path | None, default=None, help="checkpoint of a training to resume")
+        parser.add_argument(
+            "--ema", type=float, default=0.0, help="decay of the weights' moving average, such as .999; 0: none"
+        )
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults(
             {
@@ -141,7 +146,8 @@ class FitCommand(LightningCLI):
         given = self.config_init["trainer"]["callbacks"] or []
         bar = [] if config["enable_progress_bar"] is False else [RichProgressBar(leave=True)]
         last = _keep_last(Path(self.config["out"]))
-        kwargs["callbacks"] = [*bar, last, *(given if isinstance(given, list) else [given])]
+        averaged = [ema(self.config["ema"])] if self.config["ema"] else []
+        kwargs["callbacks"] = [*bar, last, *averaged, *(given if isinstance(given, list) else [given])]
         return super().instantiate_trainer(**kwargs)
 
     def run(self) -> None:
@@ -149,7 +155,15 @@ class FitCommand(LightningCLI):
         checkpoint: Path | None = self.config["ckpt_path"]
         if checkpoint is not None and not checkpoint.is_file():
             raise CohdcError(f"{checkpoint}: no such file")
+        if self.datamodule.batch_size == "auto":
+            self._choose_batch_size()
         self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=checkpoint)
+
+    def _choose_batch_size(self) -> None:
+        if self.trainer.world_size > 1:
+            raise CohdcError("batch_size auto: works on one device; give the number it finds there to several")
+        self.datamodule.batch_size = largest_batch(self.model, self.datamodule, self.trainer.strategy.root_device)
+        print(f"batch size: {self.datamodule.batch_size}")
 
 
 def _keep_last(folder: Path) -> ModelCheckpoint:

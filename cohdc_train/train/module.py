@@ -3,53 +3,18 @@
 import dataclasses
 import math
 import pickle
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
-from torch.optim.lr_scheduler import LambdaLR
 
 from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
 from cohdc_train.train.metrics import SegmentationMetrics
-
-
-@dataclass(frozen=True)
-class OptimizerConfig:
-    """The optimizer and its learning rate, per step: a linear warm-up, then half a cosine.
-
-    Attributes:
-        name: "sgd" or "adamw".
-        lr: learning rate behind the warm-up.
-        weight_decay: of weights; biases and norms have none.
-        momentum: of SGD.
-        warmup_steps: steps from 0 to lr, at most a tenth of the training.
-        final_fraction: share of lr left at the last step; 1 keeps it constant.
-    """
-
-    name: Literal["sgd", "adamw"] = "adamw"
-    lr: float = 2e-4
-    weight_decay: float = 0.05
-    momentum: float = 0.9
-    warmup_steps: int = 200
-    final_fraction: float = 0.01
-
-    def __post_init__(self) -> None:
-        if self.lr <= 0 or not 0 <= self.final_fraction <= 1:
-            raise ValueError(f"lr {self.lr} must be above 0 and final_fraction {self.final_fraction} in 0..1")
-
-    def factor(self, step: int, total: int) -> float:
-        """Share of lr at a step of `total`."""
-        warmup = min(self.warmup_steps, total // 10)
-        if step < warmup:
-            return (step + 1) / (warmup + 1)
-        done = min(1.0, (step - warmup) / max(1, total - warmup))
-        return self.final_fraction + (1 - self.final_fraction) * 0.5 * (1 + math.cos(math.pi * done))
-
+from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer
 
 MIN_CANVAS = 32  # px: one cell of the coarsest level that RoIs are pooled from
 _NETWORK = NetworkConfig()
@@ -147,22 +112,13 @@ class MaskRCNNModule(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Optimizer over what is trained, and its schedule over the trainer's steps."""
-        config = self.optimizer_config
-        trained = [p for p in self.network.parameters() if p.requires_grad]
-        groups = [
-            {"params": [p for p in trained if p.ndim > 1], "weight_decay": config.weight_decay},
-            {"params": [p for p in trained if p.ndim <= 1], "weight_decay": 0.0},
-        ]
-        optimizer: torch.optim.Optimizer
-        if config.name == "sgd":
-            optimizer = torch.optim.SGD(groups, lr=config.lr, momentum=config.momentum)
-        else:
-            # Fused saves a tenth of a step on a CPU; in mixed precision Lightning cannot clip its gradients.
-            optimizer = torch.optim.AdamW(groups, lr=config.lr, fused=self.trainer.precision == "32-true")
         total = self.trainer.estimated_stepping_batches
         if math.isinf(total):
             raise CohdcError("the schedule needs an end: give trainer.max_epochs or trainer.max_steps")
-        schedule = LambdaLR(optimizer, lambda step: config.factor(step, int(total)))
+        # Fused saves a tenth of a step on a CPU; in mixed precision Lightning cannot clip its gradients.
+        optimizer, schedule = build_optimizer(
+            self.optimizer_config, self.network, int(total), fused=self.trainer.precision == "32-true"
+        )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

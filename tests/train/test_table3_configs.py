@@ -10,29 +10,29 @@ from cohdc_train.presets import config_path
 from cohdc_train.train.cli import fit
 
 # Paper, Table 3 and the text of section 3.1.1: train images, validation images, epochs, (width, height) of the image,
-# smallest anchor scale of four that double, learning rate, pre-trained model.
+# side of the mini-mask, smallest anchor scale of four that double, learning rate, pre-trained model.
 TABLE = {
-    1: (680, 120, 100, (1024, 800), 32, 0.001, False),
-    2: (680, 120, 200, (1024, 800), 32, 0.001, False),
-    3: (820, 140, 200, (1024, 800), 32, 0.001, False),
-    4: (1014, 180, 400, (1024, 800), 32, 0.001, False),
-    5: (1014, 180, 400, (1920, 1080), 32, 0.02, False),
-    6: (1014, 180, 100, (1024, 800), 32, 0.001, False),
-    7: (1014, 180, 100, (1920, 1080), 16, 0.001, False),
-    8: (1014, 180, 100, (1920, 1080), 8, 0.001, False),
-    9: (480, 120, 100, (1920, 1080), 8, 0.001, False),
-    10: (480, 120, 100, (1920, 1080), 8, 0.001, True),
+    1: (680, 120, 100, (1024, 800), 56, 32, 0.001, False),
+    2: (680, 120, 200, (1024, 800), 56, 32, 0.001, False),
+    3: (820, 140, 200, (1024, 800), 56, 32, 0.001, False),
+    4: (1014, 180, 400, (1024, 800), 56, 32, 0.001, False),
+    5: (1014, 180, 400, (1920, 1080), 56, 32, 0.02, False),
+    6: (1014, 180, 100, (1024, 800), 28, 32, 0.001, False),
+    7: (1014, 180, 100, (1920, 1080), 28, 16, 0.001, False),
+    8: (1014, 180, 100, (1920, 1080), 28, 8, 0.001, False),
+    9: (480, 120, 100, (1920, 1080), 28, 8, 0.001, False),
+    10: (480, 120, 100, (1920, 1080), 28, 8, 0.001, True),
 }
 
 
 @pytest.mark.parametrize("test", TABLE)
 def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
-    train, val, epochs, (width, height), scale, lr, pretrained = TABLE[test]
+    train, val, epochs, (width, height), mini, scale, lr, pretrained = TABLE[test]
     network: dict[str, Any] = {"anchor_scales": [scale, 2 * scale, 4 * scale, 8 * scale]}
     if pretrained:
         network["weights"] = "IMAGENET1K_V1"
     expected = {
-        "data": {"canvas": [height, width], "subset": {"train": train, "val": val}},
+        "data": {"canvas": [height, width], "mini_mask": [mini, mini], "subset": {"train": train, "val": val}},
         "model": {"network": network, "optimizer": {"name": "sgd", "lr": lr}},
         "trainer": {"max_epochs": epochs},
     }

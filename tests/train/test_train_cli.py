@@ -184,3 +184,28 @@ def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> 
     shown: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
     assert shown["data"]["canvas"] == [800, 1024]
     assert shown["checkpoint"]["monitor"] == "val/segm_AP"
+
+
+def test_an_average_of_the_weights_is_validated_and_kept(toy: Path, run: Path, tmp_path: Path) -> None:
+    """Another network than the last step's, which is kept beside it so that a resume goes on from there."""
+    fit(arguments(toy, tmp_path, "--ema=0.99"))
+    checkpoint = torch.load(tmp_path / "best.ckpt", weights_only=True)
+    plain = torch.load(run / "best.ckpt", weights_only=True)
+    name = "network.rpn.head.bbox_pred.weight"
+    assert not torch.equal(checkpoint["state_dict"][name], plain["state_dict"][name])
+    assert torch.equal(checkpoint["current_model_state"][name], plain["state_dict"][name])
+    assert MaskRCNNModule.load(tmp_path / "best.ckpt").class_names == ["person", "car"]
+    fit(arguments(toy, tmp_path, "--ema=0.99", f"--ckpt_path={tmp_path / 'last.ckpt'}", "--trainer.max_epochs=2"))
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 1
+
+
+def test_a_decay_of_one_is_refused(toy: Path, tmp_path: Path) -> None:
+    with pytest.raises(CohdcError, match="ema 1"):
+        fit(arguments(toy, tmp_path, "--ema=1.0"))
+
+
+def test_the_batch_size_is_found(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fit(arguments(toy, tmp_path, "--data.batch_size=auto", "--data.mini_mask=[28,28]"))
+    assert "batch size: 32" in capsys.readouterr().out
+    with pytest.raises(CohdcError, match="works on one device"):
+        fit(arguments(toy, tmp_path, "--data.batch_size=auto", "--trainer.devices=2"))
