@@ -1,0 +1,93 @@
+"""Trainings of tools/table3 and tools/ablations, each in its own process; what is scored once is not trained again.
+
+Imported by the tools beside it; runs the checkout's `cohdc fit` and `cohdc validate` with the present interpreter.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+Scores = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training and how it is scored.
+
+    Attributes:
+        folder: where checkpoints, log and scores.json go.
+        data: COCO-format folders; the first one's val split is scored.
+        options: of `cohdc fit`.
+        scorings: name -> options of `cohdc validate` on last.ckpt; every name's scores are kept.
+    """
+
+    folder: Path
+    data: tuple[Path, ...]
+    options: tuple[str, ...]
+    scorings: dict[str, tuple[str, ...]] = field(default_factory=lambda: {"plain": ()})
+
+    def scores(self) -> dict[str, Scores]:
+        """Train and score, unless the folder holds the scores of the same options."""
+        kept = self.folder / "scores.json"
+        asked = {"options": list(self.options), "scorings": {k: list(v) for k, v in self.scorings.items()}}
+        if kept.is_file() and (known := json.loads(kept.read_text()))["asked"] == asked:
+            return known["scores"]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        start = time.monotonic()
+        roots = f"[{','.join(str(root) for root in self.data)}]"
+        self._call("fit", f"--data.root={roots}", f"--out={self.folder}", "--data.workers=0", *self.options)
+        seconds = time.monotonic() - start
+        scores: dict[str, Scores] = {}
+        for name, options in self.scorings.items():
+            out = self.folder / f"scores_{name}.json"
+            last = str(self.folder / "last.ckpt")
+            self._call("validate", last, str(self.data[0]), f"--out={out}", "--workers=0", *options)
+            scores[name] = json.loads(out.read_text()) | {"seconds": seconds}
+        temporary = kept.with_suffix(".part")
+        temporary.write_text(json.dumps({"asked": asked, "scores": scores}, indent=2))
+        temporary.replace(kept)
+        return scores
+
+    def _call(self, verb: str, *arguments: str) -> None:
+        """Run a verb on one thread; its output goes to log.txt. Exits naming the log when it fails."""
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+        log = self.folder / "log.txt"
+        with log.open("a") as stream:
+            command = [sys.executable, "-m", "cohdc_train", verb, *arguments]
+            print("+", *command, file=stream, flush=True)
+            done = subprocess.run(command, env=environment, stdout=stream, stderr=stream, check=False)
+        if done.returncode:
+            raise SystemExit(f"cohdc {verb} failed with {done.returncode}: see {log}")
+
+
+def run_all(runs: Sequence[Run], jobs: int) -> list[dict[str, Scores]]:
+    """The scores of every run, `jobs` at a time, in their order; says how far it is."""
+
+    def one(run: Run) -> dict[str, Scores]:
+        scores = run.scores()
+        print(
+            f"{run.folder}: " + ", ".join(f"{k} mask AP50 {v['segm_AP50']:.3f}" for k, v in scores.items()), flush=True
+        )
+        return scores
+
+    with ThreadPoolExecutor(jobs) as pool:
+        return list(pool.map(one, runs))
+
+
+def spread(values: Sequence[float]) -> str:
+    """Mean and, in brackets, the smallest and largest over the seeds."""
+    return f"{statistics.fmean(values):.3f} ({min(values):.3f}-{max(values):.3f})"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
