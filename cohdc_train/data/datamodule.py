@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
@@ -14,8 +15,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from cohdc_train.data import image_files
 from cohdc_train.data.annotations import read_image
-from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder
-from cohdc_train.data.layout import CocoPaths
+from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder, read_split
+from cohdc_train.data.layout import CocoPaths, find_split
 from cohdc_train.data.train_set import CocoTrainSet, Target
 from cohdc_train.data.transforms import Augmentation, blank_padding, photometric_augmentation
 from cohdc_train.errors import DataError
@@ -84,6 +85,8 @@ class CocoDataModule(pl.LightningDataModule):
         mini_mask: (height, width) in cells at which each training mask is kept, on its box: less memory for many
             objects, softer contours for large ones. None keeps whole masks.
         subset: how many images of each split to use.
+        cutouts: folders of the same classes whose training objects are pasted into the pictures of `root`, but whose
+            pictures are not trained on; with `augment.copy_paste`.
         paths: annotation files and image folders, where the layout is an unusual one.
 
     Raises:
@@ -100,6 +103,7 @@ class CocoDataModule(pl.LightningDataModule):
         augment: Augmentation = _AUGMENTATION,
         mini_mask: tuple[int, int] | None = None,
         subset: Subset = _EVERYTHING,
+        cutouts: list[Path] | None = None,
         paths: CocoPaths | None = None,
     ) -> None:
         super().__init__()
@@ -111,6 +115,9 @@ class CocoDataModule(pl.LightningDataModule):
         self.augment = augment
         self.mini_mask = mini_mask
         self.subset = subset
+        self.cutouts = cutouts or []
+        if self.cutouts and not augment.copy_paste:
+            raise DataError("data.cutouts are pasted nowhere: give data.augment.copy_paste, a probability")
         self.paths = paths
         self._folder: CocoFolder | None = None
         self._photometric = photometric_augmentation(augment)
@@ -123,6 +130,12 @@ class CocoDataModule(pl.LightningDataModule):
             train = tuple(split.subset(self.subset.train) for split in whole.train)
             self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
         return self._folder
+
+    @cached_property
+    def givers(self) -> tuple[CocoSplit, ...]:
+        """The training splits whose objects are pasted: those of `root` and of `cutouts`."""
+        given = [read_split("train", find_split(root, "train"), self.classes) for root in self.cutouts]
+        return (*self.folder.train, *(split.relabelled(self.folder.class_names) for split in given))
 
     @property
     def class_names(self) -> list[str]:
@@ -139,7 +152,7 @@ class CocoDataModule(pl.LightningDataModule):
 
         Raises DataError naming an image that is missing, damaged or not of its annotated size.
         """
-        splits = [self.folder.val, *(self.folder.train if stage == "fit" else ())]
+        splits = [self.folder.val, *(self.givers if stage == "fit" else ())]
         for split in splits:
             if split.losses():
                 rank_zero_info(split.losses())
@@ -152,8 +165,10 @@ class CocoDataModule(pl.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled batches of `TrainBatch`; the order and every draw follow torch's seed."""
-        images = [image for split in self.folder.train for image in split.images]
-        training = CocoTrainSet(images, self.canvas, self.augment, self.mini_mask)
+        images, givers = (
+            [image for split in splits for image in split.images] for splits in (self.folder.train, self.givers)
+        )
+        training = CocoTrainSet(images, self.canvas, self.augment, self.mini_mask, givers)
         return self._loader(training, shuffle=True, collate=_collate_train)
 
     def val_dataloader(self) -> DataLoader[Any]:

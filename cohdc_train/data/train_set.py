@@ -33,7 +33,8 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
     """Augmented training images on the canvas, with boxes recomputed from what is left of the masks.
 
     images: of every root; canvas: (height, width) px; augment: what they go through; mini_mask: (height, width) in
-    cells that each mask is kept at, on its box, instead of on the canvas.
+    cells that each mask is kept at, on its box, instead of on the canvas; givers: the images whose objects are pasted,
+    `images` themselves when not given.
     """
 
     def __init__(
@@ -42,8 +43,10 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         canvas: tuple[int, int],
         augment: Augmentation,
         mini_mask: tuple[int, int] | None = None,
+        givers: Sequence[CocoImage] | None = None,
     ) -> None:
         self.images = images
+        self.givers = givers or images
         self.canvas = canvas
         self.augment = augment
         self.mini_mask = mini_mask
@@ -56,7 +59,7 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         image = self.images[index]
         scene = self._place(image, [o for o in image.objects if not o.crowd])
         if self.augment.copy_paste > 0 and torch.rand(()) < self.augment.copy_paste:
-            scene = self._paste(self.images[int(torch.randint(len(self.images), ()))], scene)
+            scene = self._paste(self.givers[int(torch.randint(len(self.givers), ()))], scene)
         return scene.image, self._target(scene, image.id)
 
     def _place(self, image: CocoImage, objects: Sequence[CocoObject]) -> _Scene:

@@ -107,3 +107,8 @@ def test_mini_masks_lie_on_their_boxes(two: list[CocoImage]) -> None:
     _, none = CocoTrainSet([CocoImage(3, two[0].path, HEIGHT, WIDTH, ())], (HEIGHT, WIDTH), STILL, (28, 28))[0]
     assert none["masks"].shape == (0, 28, 28)
     assert none["frames"].shape == (0, 4)
+
+
+def test_only_givers_give(two: list[CocoImage]) -> None:
+    pasted = samples(two[:1], PASTING, 10, givers=two[1:])
+    assert [t["labels"].tolist() for _, t in pasted] == [[1, 2]] * 10
