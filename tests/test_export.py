@@ -82,9 +82,11 @@ def test_another_canvas_than_the_trainings(checkpoint, opinionated, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cqe", ["multiply", "add", "off"])
-def test_every_form_of_the_quality_head_exports(cqe, opinionated, tmp_path):
-    module = MaskRCNNModule(["person", "car"], dataclasses.replace(opinionated.config, cqe=cqe))
+@pytest.mark.parametrize(("cqe", "side"), [("multiply", 28), ("add", 28), ("off", 28), ("concat", 56), ("add", 56)])
+def test_every_form_of_mask_and_quality_head_exports(cqe, side, opinionated, tmp_path):
+    torch.manual_seed(0)
+    config = dataclasses.replace(opinionated.config, cqe=cqe, mask_size=side)
+    module = MaskRCNNModule(["person", "car"], config)
     rest = {name: value for name, value in opinionated.state_dict().items() if not name.startswith("cqe.")}
     module.network.load_state_dict(rest, strict=False)
     torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / f"{cqe}.ckpt")

@@ -92,6 +92,13 @@ def test_only_dynamic_classes_above_the_score_count() -> None:
     assert not dynamic_mask(detections(), frozenset([0]), Culling()).any()
 
 
+def test_the_papers_filter_leaves_a_doubted_contour_out() -> None:
+    box = (10.0, 10.0, 30.0, 30.0)
+    for quality, dynamic in ((0.95, True), (0.85, False)):
+        found = dynamic_mask(detections((box, 0, 0.9, quality)), frozenset([0]), Culling(quality=0.9, dilate=0))
+        assert found.any() == dynamic
+
+
 def test_grow_is_a_disc() -> None:
     mask = np.zeros((41, 41), dtype=np.bool_)
     mask[20, 20] = True
