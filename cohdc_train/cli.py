@@ -18,7 +18,9 @@ class Verb(NamedTuple):
 
 VERBS = {
     "demo": Verb("demo", "demo", "the whole way on a rendered room: data, training, ONNX, SLAM, scores, report"),
-    "data": Verb("data.doctor", "COMMANDS", "look at a COCO-format folder: counts per class and split"),
+    "data": Verb(
+        "data.commands", "COMMANDS", "look at a COCO-format folder, or make one of labelme, VIA, YOLO or VOC files"
+    ),
     "synth": Verb("synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"),
     "fit": Verb("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),
     "validate": Verb("train.cli", "validate", "score a checkpoint on a COCO-format folder"),

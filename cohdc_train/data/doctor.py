@@ -1,4 +1,4 @@
-"""`cohdc data`: look at a COCO-format folder without training on it (no torch)."""
+"""`cohdc data doctor` and `stats`: look at a COCO-format folder without training on it (no torch)."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -97,6 +97,12 @@ def count(split: CocoSplit) -> dict[str, Any]:
     }
 
 
+def summary(split: CocoSplit) -> str:
+    """The counts of one split that are not zero, in one line."""
+    shown = [f"{name} {value}" for name, value in count(split).items() if name != "annotations" and value]
+    return f"{split.name}: {'; '.join(shown[:_SHOWN])}" + ("; ..." if len(shown) > _SHOWN else "")
+
+
 def _compare(train: Inspection, val: Inspection) -> None:
     """Findings between the splits: classes, and images that are in both."""
     names = [{row["id"]: str(row["name"]) for row in split.content["categories"]} for split in (train, val)]
@@ -136,9 +142,7 @@ def _write_mended(splits: Sequence[Inspection], folder: Path) -> None:
 
 def _print_statistics(splits: Sequence[CocoSplit], canvas: tuple[int, int], scales: Sequence[int]) -> None:
     for split in splits:
-        counts = count(split)
-        shown = [f"{name} {value}" for name, value in counts.items() if name != "annotations" and value]
-        print(f"{split.name}: {'; '.join(shown[:_SHOWN])}" + ("; ..." if len(shown) > _SHOWN else ""))
+        print(summary(split))
     print(f"Table 3 columns it has images enough for: {', '.join(_columns(splits)) or 'none'}")
     print(f"anchors {list(scales)} on a canvas of {canvas[0]}x{canvas[1]} px, objects of train:")
     boxes = _boxes(splits[0], canvas)
@@ -166,6 +170,3 @@ def _columns(splits: Sequence[CocoSplit]) -> list[str]:
         if all(wanted.get(split.name, 0) <= len(split.images) for split in splits):
             names.append(f"test{number:02}")
     return names
-
-
-COMMANDS = {"stats": stats, "doctor": doctor}

@@ -14,6 +14,7 @@ _TAIL = 4096  # bytes at a file's end in which its end mark is looked for
 _END_MARKS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 _PLAIN_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 _SIDE = 16  # px, of a fingerprint
+PROBLEMS = {"missing": "does not exist", "truncated": "ends early", "corrupt": "cannot be read as an image"}
 
 
 class ImageFile(NamedTuple):
@@ -57,8 +58,7 @@ def check(path: Path, image_id: int, size: tuple[int, int]) -> None:
     """Raise DataError naming file and id unless it can be read and is of the annotated size (width, height), px."""
     file = look(path)
     if file.problem:
-        what = {"missing": "does not exist", "truncated": "ends early"}.get(file.problem, "cannot be read as an image")
-        raise DataError(f"{path}: image {image_id} {what}")
+        raise DataError(f"{path}: image {image_id} {PROBLEMS[file.problem]}")
     check_size(path, image_id, (file.width, file.height), size)
 
 

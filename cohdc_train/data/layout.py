@@ -66,19 +66,24 @@ def find_split(root: Path, name: str) -> SplitPaths:
     return SplitPaths(annotations, images or next((p for p in places if p.is_dir()), root / "images"))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """An annotation file as a dict with lists `images`, `annotations` and `categories`.
-
-    Raises DataError naming the file when it is missing, is no JSON (with the line), or lacks one of the lists.
-    """
+def load_json(path: Path) -> Any:
+    """The content of a JSON file. Raises DataError naming the file when it is missing or no JSON (with the line)."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
     except json.JSONDecodeError as error:
         raise DataError(f"{path}: line {error.lineno}: not JSON: {error.msg}") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """An annotation file as a dict with lists `images`, `annotations` and `categories`.
+
+    Raises DataError naming the file when it is missing, is no JSON (with the line), or lacks one of the lists.
+    """
+    content = load_json(path)
     for key in ("images", "annotations", "categories"):
         if not isinstance(content, dict) or not isinstance(content.get(key), list):
             raise DataError(f"{path}: not COCO format: no list {key!r}")

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
+from cohdc_train.files import new_folder
 from cohdc_train.synth import people as bodies
 from cohdc_train.synth.annotation import annotate
-from cohdc_train.synth.folder import new_folder
 from cohdc_train.synth.mesh import Floats, join
 from cohdc_train.synth.renderer import Atlas, Camera, render
 from cohdc_train.synth.scene import Lighting, Room, furnished_room, texture_detail

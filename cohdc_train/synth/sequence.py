@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
+from cohdc_train.files import new_folder
 from cohdc_train.synth import people as bodies
-from cohdc_train.synth.folder import new_folder
 from cohdc_train.synth.mesh import Mesh, join, yaw_rotation
 from cohdc_train.synth.motion import MOTIONS, CameraMotion, Doubles, Walk, camera_path, crowd
 from cohdc_train.synth.renderer import Atlas, Camera, View, render

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from cohdc_train.errors import DataError
 from cohdc_train.synth import sequence
-from cohdc_train.synth.folder import new_folder
 from cohdc_train.synth.renderer import render
 from cohdc_train.synth.sequence import draw_scene
 
@@ -180,22 +179,6 @@ def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object],
         sequence(tmp_path / "s", **arguments)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
-
-
-def test_folders_are_whole_or_absent(tmp_path: Path) -> None:
-    out = tmp_path / "deep" / "out"
-    with pytest.raises(FileNotFoundError), new_folder(out) as draft:
-        (draft / "absent" / "half").write_text("x")
-    assert not list((tmp_path / "deep").iterdir())
-    out.mkdir()
-    with new_folder(out) as draft:
-        (draft / "whole").write_text("x")
-    assert (out / "whole").read_text() == "x"
-    with pytest.raises(DataError, match="holds 1 entries already"), new_folder(out):
-        pass
-    with pytest.raises(DataError, match="is not a folder"), new_folder(out / "whole"):
-        pass
-    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["out"]
 
 
 def test_importing_the_room_is_cheap() -> None:

@@ -1,0 +1,6 @@
+"""The verbs of `cohdc data` (no torch)."""
+
+from cohdc_train.data.convert import convert
+from cohdc_train.data.doctor import doctor, stats
+
+COMMANDS = {"stats": stats, "doctor": doctor, "convert": convert}

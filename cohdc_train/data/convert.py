@@ -1,0 +1,178 @@
+"""`cohdc data convert`: labelme, VIA, YOLO and Pascal VOC -> a COCO-format folder (no torch)."""
+
+import io
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from cohdc_train.data.coco import CocoSplit, read_split
+from cohdc_train.data.doctor import summary
+from cohdc_train.data.examination import examine
+from cohdc_train.data.findings import KINDS
+from cohdc_train.data.formats import Source, SourceImage
+from cohdc_train.data.formats_labelme import read_labelme
+from cohdc_train.data.formats_via import read_via
+from cohdc_train.data.formats_voc import read_voc
+from cohdc_train.data.formats_yolo import read_yolo
+from cohdc_train.data.layout import find_split
+from cohdc_train.errors import DataError
+from cohdc_train.files import new_folder, write_text
+
+Format = Literal["labelme", "via", "yolo", "voc"]
+_JPEG_QUALITY = 95  # of images that have to be turned
+_UPRIGHT = "image turned as its EXIF says, and written anew"
+
+
+def convert(
+    format: Format,
+    source: Path,
+    out: Path,
+    val: float = 0.2,
+    seed: int = 0,
+    attribute: str | None = None,
+    names: Path | None = None,
+) -> None:
+    """Make a COCO-format folder of annotations in another format; what cannot be converted is left out and counted.
+
+    Writes `images/` (hard links where possible: do not edit them), `instances_train.json` and `instances_val.json`,
+    all or nothing. Raises DataError in one line that names the file and the row.
+
+    Args:
+        format: labelme: a folder of images, one JSON each. via: VGG Image Annotator's JSON beside its images. yolo:
+            Ultralytics' data.yaml, or its folder. voc: Pascal VOC's folder of segmentation PNGs, or CVAT's.
+        source: the folder, or the annotation file.
+        out: the folder to write, absent or empty.
+        val: share of the images that go to validation, where the source has no split of its own.
+        seed: of the shuffle that chooses them; the same images for the same seed.
+        attribute: via: the region attribute that holds the class, where there are several.
+        names: voc: file with a class per line, or CVAT's labelmap.txt. via: file with the one class of all regions.
+    """
+    with new_folder(out) as draft:
+        found = _read(format, source, attribute, names)
+        splits = _split(source, found, val, seed)
+        classes = found.class_names or sorted({o.name for images in splits.values() for i in images for o in i.objects})
+        file_names = _write_images(splits.values(), draft / "images", found)
+        for name, images in splits.items():
+            content = _content(images, file_names, classes, found)
+            if not content["annotations"]:
+                lost = "; ".join(f"{len(places)} left out: {why}" for why, places in found.left_out.items())
+                raise DataError(
+                    f"{source}: no object in {name} of {len(images)} images" + (f"; {lost}" if lost else "")
+                )
+            write_text(draft / f"instances_{name}.json", json.dumps(content))
+        written = [_read_back(draft, name, out) for name in splits]
+    print("split: " + (f"drawn, --val {val} --seed {seed}" if "" in found.splits else "the source's own"))
+    print("\n".join(summary(split) for split in written))
+    _print_counts("left out", found.left_out)
+    _print_counts("worth knowing", found.notes)
+    print(f"next: cohdc data doctor {out}")
+
+
+def _read(format: Format, source: Path, attribute: str | None, names: Path | None) -> Source:
+    if attribute is not None and format != "via":
+        raise DataError(f"--attribute is for via, not for {format}")
+    if names is not None and format not in ("via", "voc"):
+        raise DataError(f"--names is for voc and via, not for {format}")
+    if format == "labelme":
+        return read_labelme(source)
+    if format == "via":
+        return read_via(source, attribute, names)
+    return read_yolo(source) if format == "yolo" else read_voc(source, names)
+
+
+def _split(source: Path, found: Source, val: float, seed: int) -> dict[str, list[SourceImage]]:
+    """The source's own split; without one, a share `val` of the images, at least one, drawn by a seeded shuffle."""
+    for images in found.splits.values():
+        path, count = Counter(image.path for image in images).most_common(1)[0] if images else (source, 1)
+        if count > 1:
+            raise DataError(f"{path}: annotated {count} times")
+    if "" not in found.splits:
+        return found.splits
+    images = sorted(found.splits[""], key=lambda image: image.path)
+    if not 0 < val < 1:
+        raise DataError(f"--val {val}: must be between 0 and 1")
+    if len(images) < 2:
+        raise DataError(f"{source}: {len(images)} image; two or more are needed, one for train and one for val")
+    count = min(max(round(val * len(images)), 1), len(images) - 1)
+    drawn = set(np.random.default_rng(seed).permutation(len(images))[:count].tolist())
+    parts = {"train": [image for i, image in enumerate(images) if i not in drawn]}
+    return parts | {"val": [image for i, image in enumerate(images) if i in drawn]}
+
+
+def _write_images(splits: Iterable[Sequence[SourceImage]], folder: Path, found: Source) -> dict[Path, str]:
+    """Write every image once; returns its file name by its path in the source.
+
+    A name alone where no other image has it, else all keep the folders they do not share.
+    """
+    images = {image.path: image for part in splits for image in part}
+    shared = Path(os.path.commonpath([path.parent for path in images])) if images else Path()
+    flat = len({path.name.casefold() for path in images}) == len(images)
+    names = {path: path.name if flat else path.relative_to(shared).as_posix() for path in images}
+    for path, image in images.items():
+        _write_image(image, folder / names[path])
+        if image.upright:
+            found.note(_UPRIGHT, str(path))
+    return names
+
+
+def _write_image(image: SourceImage, target: Path) -> None:
+    """Link, copy, unpack or turn one image."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if image.upright:
+        with Image.open(io.BytesIO(image.pixels()) if image.pixels else image.path) as picture:
+            ImageOps.exif_transpose(picture).save(target, quality=_JPEG_QUALITY)
+    elif image.pixels:
+        target.write_bytes(image.pixels())
+    else:
+        try:
+            os.link(image.path.resolve(), target)
+        except OSError:  # another disk, or a file system without links
+            shutil.copyfile(image.path, target)
+
+
+def _content(
+    images: Sequence[SourceImage], file_names: Mapping[Path, str], classes: Sequence[str], found: Source
+) -> dict[str, Any]:
+    """The COCO dict of a split. Objects without a pixel are left out; what reaches out of the image is cut off."""
+    ids = {name: i for i, name in enumerate(classes, start=1)}
+    rows: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for image_id, image in enumerate(images, start=1):
+        size = {"width": image.width, "height": image.height}
+        rows.append({"id": image_id, "file_name": file_names[image.path], **size})
+        for o in image.objects:
+            seen = examine({"segmentation": o.segmentation}, image.height, image.width)
+            kinds = [KINDS[kind].what for kind in seen.findings if kind != "box-missing"]
+            if seen.row is None:
+                found.leave_out(kinds.pop(), o.where)
+            else:
+                owner = {"id": len(annotations) + 1, "image_id": image_id, "category_id": ids[o.name], "iscrowd": 0}
+                annotations.append(owner | seen.row)
+            for kind in kinds:
+                found.note(kind, o.where)
+    categories = [{"id": i, "name": name} for name, i in ids.items()]
+    return {"images": rows, "annotations": annotations, "categories": categories}
+
+
+def _read_back(draft: Path, name: str, out: Path) -> CocoSplit:
+    """The written split as training will read it."""
+    files = find_split(draft, name)
+    if files.images != draft / "images":
+        folder = files.images.relative_to(draft)
+        raise DataError(f"{out}: images in {folder} would be taken for others of the same name; rename the source's")
+    return read_split(name, files)
+
+
+def _print_counts(title: str, counts: Mapping[str, Sequence[str]]) -> None:
+    """How often each thing happened, and where first."""
+    if counts:
+        print(f"{title}:")
+    for what, places in sorted(counts.items()):
+        print(f"  {len(places):>6}  {what}: {places[0]}" + (" ..." if len(places) > 1 else ""))

@@ -1,0 +1,189 @@
+"""What a foreign annotation format holds before it becomes COCO: images, objects, and what was left out (no torch)."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as rle
+
+from cohdc_train.data.image_files import PROBLEMS, look
+from cohdc_train.errors import DataError
+
+IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
+_SPLIT_FOLDERS = {"train": "train", "val": "val", "valid": "val"}
+_SAGITTA = 0.05  # px by which an arc may leave the chord that stands for it
+
+
+class SourceObject(NamedTuple):
+    """One object.
+
+    name: its class. segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE. where: file and row.
+    """
+
+    name: str
+    segmentation: Any
+    where: str
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """One image and its objects.
+
+    Attributes:
+        path: its file, absolute; with `pixels`, the name it would have.
+        width, height: px, of the picture that the objects are drawn on.
+        upright: that picture is the file's turned as its EXIF says.
+        pixels: gives the file's bytes where they are inside the annotation file.
+        objects: what is annotated.
+    """
+
+    path: Path
+    width: int
+    height: int
+    upright: bool = False
+    pixels: Callable[[], bytes] | None = None
+    objects: tuple[SourceObject, ...] = ()
+
+    def holding(self, objects: Sequence[SourceObject]) -> "SourceImage":
+        """The same image with these objects."""
+        return replace(self, objects=tuple(objects))
+
+
+@dataclass
+class Source:
+    """Everything that was read.
+
+    Attributes:
+        splits: "train" and "val" -> images; or only "" when the source has no split of its own.
+        class_names: in the format's own order; None where it has none.
+        left_out: why -> where, of what is not converted.
+        notes: what -> where, of what is converted but not as it was.
+    """
+
+    splits: dict[str, list[SourceImage]] = field(default_factory=dict)
+    class_names: tuple[str, ...] | None = None
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+    notes: dict[str, list[str]] = field(default_factory=dict)
+
+    def leave_out(self, why: str, where: str) -> None:
+        """Count one thing that is not converted."""
+        self.left_out.setdefault(why, []).append(where)
+
+    def note(self, what: str, where: str) -> None:
+        """Count one thing worth knowing."""
+        self.notes.setdefault(what, []).append(where)
+
+
+def annotation_files(root: Path) -> dict[str, list[Path]]:
+    """Split -> the JSON files of it: a file alone, or all below a folder but those in hidden folders.
+
+    The splits are "train" and "val" where all files lie in folders of these names (`valid` counts as `val`), else
+    there is only "". Raises DataError naming the folder when it is missing or holds no JSON.
+    """
+    if root.is_file():
+        return {"": [root]}
+    files = _below(root, {".json"})
+    if not files:
+        raise DataError(f"{root}: {'no JSON file below it' if root.is_dir() else 'no such file or folder'}")
+    splits: dict[str, list[Path]] = {}
+    for path in files:
+        splits.setdefault(_SPLIT_FOLDERS.get(path.relative_to(root).parts[0], ""), []).append(path)
+    return splits if set(splits) == {"train", "val"} else {"": files}
+
+
+def leave_out_strays(root: Path, source: Source, why: str) -> None:
+    """Count the image files below a folder that no annotation file speaks of."""
+    known = {image.path.resolve() for images in source.splits.values() for image in images}
+    for path in _below(root, IMAGE_SUFFIXES):
+        if path.resolve() not in known:
+            source.leave_out(why, str(path))
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """(number, text) of the lines that are not empty. Raises DataError naming the file when it cannot be read."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read: {error}") from error
+    return [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
+
+
+def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceImage:
+    """The image of a file, without objects. annotated: (width, height), px, where the format tells it.
+
+    Annotation tools show a picture turned as its EXIF says, so that is what the objects are drawn on, unless the
+    annotated size is that of the unturned pixels only.
+    Raises DataError naming the file when it cannot be read or is of another size.
+    """
+    file = look(path)
+    if file.problem:
+        raise DataError(f"{path}: {PROBLEMS[file.problem]}")
+    stored = (file.width, file.height)
+    path = Path(os.path.abspath(path))
+    shown = stored[::-1] if file.turned else stored
+    if annotated in (None, shown):
+        return SourceImage(path, *shown, upright=file.oriented)
+    if annotated == stored:
+        return SourceImage(path, *stored)
+    raise DataError(f"{path}: is {stored[0]}x{stored[1]}, its annotation {annotated[0]}x{annotated[1]}")
+
+
+def numbers(values: Any, count: int | None = None) -> list[float]:
+    """The values as finite floats. Raises TypeError or ValueError when they are not, or not `count` of them."""
+    try:
+        found = [float(value) for value in values]
+    except OverflowError as error:
+        raise ValueError("too large") from error
+    if not all(map(math.isfinite, found)) or (count is not None and len(found) != count):
+        raise ValueError(f"{len(found)} numbers")
+    return found
+
+
+def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[float]:
+    """A polygon [x, y, ...] from two opposite corners, px."""
+    return [x0, y0, x1, y0, x1, y1, x0, y1]
+
+
+def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> list[float]:
+    """A polygon [x, y, ...] from centre and half axes, px, turned by theta, rad, from x towards y.
+
+    Raises ValueError when a half axis is not positive.
+    """
+    if min(rx, ry) <= 0:
+        raise ValueError("half axis")
+    count = max(16, math.ceil(math.pi / math.acos(max(1 - _SAGITTA / max(rx, ry), 0.5))))
+    angle = np.arange(count) * (2 * math.pi / count)
+    along, across = rx * np.cos(angle), ry * np.sin(angle)
+    x = cx + along * math.cos(theta) - across * math.sin(theta)
+    y = cy + along * math.sin(theta) + across * math.cos(theta)
+    flat: list[float] = np.stack([x, y], axis=1).ravel().round(3).tolist()
+    return flat
+
+
+def encode(mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """The compressed RLE of a mask [H, W]."""
+    return dict(rle.encode(np.asfortranarray(mask, dtype=np.uint8)))
+
+
+def join(parts: Sequence[Any], height: int, width: int) -> Any:
+    """One segmentation of an object's polygons [x, y, ...] and RLEs: polygons, or an RLE where there is one among them.
+
+    height, width: px, of the image.
+    """
+    if all(isinstance(part, list) for part in parts):
+        return list(parts)
+    encoded = [rle.frPyObjects([part], height, width)[0] if isinstance(part, list) else part for part in parts]
+    return rle.merge(encoded)
+
+
+def _below(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
+    """Files of these suffixes below a folder, sorted, but those whose path has a hidden part."""
+    found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
+    return sorted(path for path in found if not any(p.startswith(".") for p in path.relative_to(root).parts))

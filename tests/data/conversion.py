@@ -1,0 +1,60 @@
+"""What the tests of `cohdc data convert` share."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import foreign_toys as toys
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cohdc_train.data.annotations import CocoObject
+from cohdc_train.data.coco import CocoImage, CocoSplit, find_split, read_split
+from cohdc_train.data.convert import convert
+from cohdc_train.errors import DataError
+
+BUILD = {"labelme": toys.labelme, "via": toys.via, "yolo": toys.yolo, "voc": toys.voc}
+FORMATS = tuple(BUILD)
+
+
+def converted(format: Any, source: Path, **options: Any) -> dict[str, CocoSplit]:
+    """Both splits of the folder it is converted to, beside the source."""
+    out = source.with_name(f"{source.name}_coco")
+    convert(format, source, out, **options)
+    return {name: read_split(name, find_split(out, name)) for name in ("train", "val")}
+
+
+def image_of(splits: dict[str, CocoSplit], name: str) -> CocoImage:
+    """The image of this file name, whichever split it is in."""
+    (found,) = [image for split in splits.values() for image in split.images if image.path.stem == name]
+    return found
+
+
+def masks_of(splits: dict[str, CocoSplit], name: str) -> list[tuple[str, NDArray[np.uint8]]]:
+    """(class, mask) of the objects of an image."""
+    image = image_of(splits, name)
+    names = splits["train"].class_names
+    return [(names[o.label - 1], o.mask(image.height, image.width)) for o in image.objects]
+
+
+def drawn(*polygons: list[float], size: tuple[int, int] = (toys.HEIGHT, toys.WIDTH)) -> NDArray[np.uint8]:
+    """The mask of polygons."""
+    return CocoObject(1, 1, (0, 0, 1, 1), 1, list(polygons), False).mask(*size)
+
+
+def iou(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def file_names(split: CocoSplit) -> list[str]:
+    return [row["file_name"] for row in json.loads(split.annotations.read_text())["images"]]
+
+
+def refused(tmp_path: Path, format: Any, source: Path, message: str, **options: Any) -> None:
+    """It is said in one line, and nothing is written."""
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(DataError, match=message) as caught:
+        convert(format, source, tmp_path / "out", **options)
+    assert "\n" not in str(caught.value)
+    assert sorted(tmp_path.rglob("*")) == before
