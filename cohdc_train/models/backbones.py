@@ -79,6 +79,19 @@ class HDCResNet(nn.Module):
             features[str(i)] = x
         return features
 
+    def rates(self) -> list[tuple[int, ...]]:
+        """Dilations of each stage's 3x3 convolutions, in their order."""
+        return [tuple(c.dilation[0] for c in _convolutions(self.get_submodule(f"layer{i}"))) for i in range(1, 5)]
+
+    def receptive_field(self) -> int:
+        """Side, in px of the input, of what a cell of the last stage sees."""
+        side, jump = 7 + 2 * 2, 4  # the first convolution, and the pooling behind it
+        for i in range(1, 5):
+            for conv in _convolutions(self.get_submodule(f"layer{i}")):
+                side += 2 * conv.dilation[0] * jump
+                jump *= conv.stride[0]
+        return side
+
     def train(self, mode: bool = True) -> "HDCResNet":
         """As nn.Module's, but frozen stages stay in evaluation mode, so that their BatchNorm statistics rest."""
         super().train(mode)
@@ -98,10 +111,13 @@ def dilate(stage: nn.Module, pattern: Sequence[int]) -> None:
 
     Raises ValueError naming the holes of a pattern that leaves some.
     """
-    convolutions = [m for m in stage.modules() if isinstance(m, nn.Conv2d) and m.kernel_size == (3, 3)]
-    free = [conv for conv in convolutions if conv.stride == (1, 1)]
+    free = [conv for conv in _convolutions(stage) if conv.stride == (1, 1)]
     for conv, rate in zip(free, cycle(pattern, len(free)), strict=True):
         conv.dilation = conv.padding = (rate, rate)
+
+
+def _convolutions(stage: nn.Module) -> list[nn.Conv2d]:
+    return [m for m in stage.modules() if isinstance(m, nn.Conv2d) and m.kernel_size == (3, 3)]
 
 
 def load_backbone_weights(backbone: HDCResNet, depth: Depth, weights: str) -> None:

@@ -24,8 +24,8 @@ class Culling:
     Args:
         dynamic_classes: names of the classes that may move; all classes of the model when not given.
         score: detections below this class score are ignored.
-        quality: detections below this CQE quality are ignored; the paper's filter is 0.9. A contour left out is a person
-            left in: by default none is.
+        quality: detections below this CQE quality are ignored; the paper's filter is 0.9. A contour left out is a
+            person left in: by default none is.
         dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (2 - q).
     """
 

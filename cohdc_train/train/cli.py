@@ -12,6 +12,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_info
 
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
@@ -157,6 +158,8 @@ class FitCommand(LightningCLI):
             raise CohdcError(f"{checkpoint}: no such file")
         if self.datamodule.batch_size == "auto":
             self._choose_batch_size()
+        body = self.model.network.backbone.body
+        rank_zero_info(f"HDC rates {body.rates()}, receptive field {body.receptive_field()} px")
         self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=checkpoint)
 
     def _choose_batch_size(self) -> None:

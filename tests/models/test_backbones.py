@@ -70,3 +70,19 @@ def test_weights_of_another_depth_are_refused_by_name(tmp_path):
 def test_a_missing_file_lists_the_published_names(tmp_path):
     with pytest.raises(FileNotFoundError, match="IMAGENET1K_V1"):
         load_backbone_weights(HDCResNet(18), 18, str(tmp_path / "nothing.pth"))
+
+
+@pytest.mark.parametrize(
+    ("depth", "rates", "side"), [(18, [(1,)] * 4, 435), (50, [(1,)] * 4, 427), (34, [(1, 2, 3)] * 4, 1619)]
+)
+def test_the_receptive_field(depth, rates, side):
+    assert HDCResNet(depth, width=0.125, rates=rates).receptive_field() == side
+
+
+def test_the_receptive_field_is_what_a_gradient_reaches():
+    body = HDCResNet(18, width=0.125, rates=[(1,), (1, 2, 3), (1,), (1,)]).eval()
+    side = body.receptive_field()
+    image = torch.rand(1, 3, 1024, 64, requires_grad=True)
+    body(image)["3"][0, :, 16, 1].sum().backward()
+    rows = image.grad.abs().sum(dim=(0, 1, 3)).nonzero()[:, 0]
+    assert side - 4 <= int(rows.max() - rows.min()) + 1 <= side
