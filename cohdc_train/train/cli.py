@@ -18,6 +18,7 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
 from cohdc_train.presets import config_path
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.train.pictures import ValidationPictures, draw_validation, write_files
 
 _USAGE = "cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR] [--print_config] [--OPTION VALUE ...]"
 _DESCRIPTION = "Train an HDC Mask R-CNN with CQE on COCO-format data."
@@ -36,7 +37,8 @@ _ADVICE = (
 def fit(args: list[str]) -> Trainer:
     """Train: `cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR]`; writes below `--out`:
 
-    `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved), `logs/version_N/` (CSV, TensorBoard).
+    `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved), `logs/version_N/` (CSV, TensorBoard),
+    `pictures/` (of best.ckpt; `pictures/last/` of the last validation; none with `--pictures false`).
     Raises CohdcError in one line for whatever the user can mend; a wrong key ends the program with code 2.
     """
     with _told_in_one_line():
@@ -72,6 +74,7 @@ def score(
     workers: int = 1,
     precision: str = "32-true",
     canvas: tuple[int, int] | None = None,
+    pictures: Path | None = None,
 ) -> dict[str, float]:
     """Print a checkpoint's scores on the validation split of a COCO-format folder.
 
@@ -85,6 +88,7 @@ def score(
         workers: processes that read images.
         precision: Lightning's precision, such as bf16-mixed.
         canvas: height and width in px to fit images into; the training's when not given.
+        pictures: folder for best.jpg, worst.jpg, pr_curves.png, calibration.png and confusion.png.
     """
     module = MaskRCNNModule.load(checkpoint, canvas)
     module.rescore = module.rescore if rescore is None else rescore
@@ -100,6 +104,8 @@ def score(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, results)
+    if pictures is not None and module.results is not None:
+        write_files(pictures, draw_validation(module.results, data.folder.val.images))
     return results
 
 
@@ -110,6 +116,7 @@ class FitCommand(LightningCLI):
         """`--out`, `--ckpt_path`, the checkpoints, and what the network takes over from the data."""
         parser.add_argument("--out", type=Path, default=Path("runs/fit"), help="folder for everything that is written")
         parser.add_argument("--ckpt_path", type=Path | None, default=None, help="checkpoint of a training to resume")
+        parser.add_argument("--pictures", type=bool, default=True, help="draw every validation, in OUT/pictures")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults(
             {
@@ -141,7 +148,9 @@ class FitCommand(LightningCLI):
         given = self.config_init["trainer"]["callbacks"] or []
         bar = [] if config["enable_progress_bar"] is False else [RichProgressBar(leave=True)]
         last = _keep_last(Path(self.config["out"]))
-        kwargs["callbacks"] = [*bar, last, *(given if isinstance(given, list) else [given])]
+        wanted = self.config["pictures"] and not config["fast_dev_run"]
+        pictures = [ValidationPictures(Path(self.config["out"]) / "pictures")] if wanted else []
+        kwargs["callbacks"] = [*bar, last, *pictures, *(given if isinstance(given, list) else [given])]
         return super().instantiate_trainer(**kwargs)
 
     def run(self) -> None:

@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
-from cohdc_train.train.metrics import SegmentationMetrics
+from cohdc_train.train.metrics import Results, SegmentationMetrics
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,7 @@ class MaskRCNNModule(pl.LightningModule):
         )
         self.network = MaskRCNN(len(self.class_names), self.network_config)
         self._metrics: SegmentationMetrics | None = None
+        self.results: Results | None = None  # of the last validation
 
     @classmethod
     def load(cls, path: Path, canvas: tuple[int, int] | None = None) -> "MaskRCNNModule":
@@ -141,7 +142,8 @@ class MaskRCNNModule(pl.LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Log the scores under `val/`."""
         assert self._metrics is not None
-        for name, value in self._metrics.compute().items():
+        self.results = self._metrics.results()
+        for name, value in self.results.scores.items():
             self.log(f"val/{name}", value, prog_bar=name == "segm_AP50", sync_dist=True)
         self._metrics = None
 
