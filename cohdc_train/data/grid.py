@@ -61,10 +61,10 @@ def tint(shown: NDArray[np.uint8], mask: NDArray[np.uint8], colour: tuple[int, i
     cv2.drawContours(shown, outlines, -1, colour, 1)
 
 
-def write_outlined(shown: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
+def write_outlined(shown: NDArray[np.uint8], text: str, place: tuple[int, int], scale: float = 0.4) -> None:
     """White letters with a black rim, in place. place: (x, y) of the text's lower left corner, px."""
     for thick, ink in ((3, (0, 0, 0)), (1, (255, 255, 255))):
-        cv2.putText(shown, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, thick, cv2.LINE_AA)
+        cv2.putText(shown, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, thick, cv2.LINE_AA)
 
 
 def _colour(label: int) -> tuple[int, int, int]:

@@ -50,6 +50,10 @@ class ImageMatch:
         """(index of the detection that found it or -1, object) of every object."""
         return [(int(i), o) for i, o in zip(self.found, self.objects, strict=True)]
 
+    def missed(self) -> list[Row]:
+        """The objects that no detection found."""
+        return [o for i, o in self.pairs() if i < 0]
+
 
 def match_images(results: Results) -> list[ImageMatch]:
     """Every image of a validation, by id.
@@ -78,8 +82,10 @@ def ranked(matches: Iterable[ImageMatch], count: int) -> tuple[list[ImageMatch],
     scored = [match for match in matches if not np.isnan(match.score)]
     count = min(count, max(1, len(scored) // 2))
     by_size = sorted(scored, key=lambda match: -len(match.objects) - len(match.detections))
-    best = sorted(by_size, key=lambda match: -match.score)[:count]
-    return best, sorted(by_size, key=lambda match: match.score)[:count]
+    worst = sorted(by_size, key=lambda match: match.score)[:count]
+    taken = {match.image_id for match in worst} if len(scored) > 1 else set()
+    others = [match for match in by_size if match.image_id not in taken]
+    return sorted(others, key=lambda match: -match.score)[:count], worst
 
 
 def confusion_matrix(matches: Iterable[ImageMatch], classes: int) -> NDArray[np.int64]:

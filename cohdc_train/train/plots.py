@@ -25,15 +25,17 @@ _STYLES = {"AP": ("AP", "-"), "AP50": ("AP50", "--"), "AP70": ("AP70", ":")}
 
 def class_names(truth: Mapping[str, Any]) -> list[str]:
     """Names of a COCO dict's categories by id, cut to what a plot has room for; a dollar starts no formula."""
-    names = [str(row["name"]) for row in sorted(truth["categories"], key=lambda row: row["id"])]
-    short = [name if len(name) <= _NAME else name[: _NAME - 1] + "…" for name in names]
-    return [name.replace("$", r"\$") for name in short]
+    return [_short(str(row["name"])) for row in sorted(truth["categories"], key=lambda row: row["id"])]
+
+
+def _short(name: str) -> str:
+    return (name if len(name) <= _NAME else name[: _NAME - 1] + "…").replace("$", r"\$")
 
 
 def plot_precision_recall(results: Results) -> bytes:
     """COCO's precision against recall of masks at IoU .5 and .75: every class that has objects, at most ten, and their
     mean, as mask AP ranks them."""
-    figure = _figure(12, 5)
+    figure = _figure(12, 6)
     names = class_names(results.truth)
     valid = [i for i in range(len(names)) if results.precision[0, 0, i] > -1]
     for axes, iou in zip(figure.subplots(1, 2, sharey=True), PR_IOUS, strict=True):
@@ -44,9 +46,9 @@ def plot_precision_recall(results: Results) -> bytes:
             who = names[valid[0]] if len(valid) == 1 else f"mean of {len(valid)} classes"
             mean = table[:, valid].mean(axis=1)
             axes.plot(RECALLS, mean, "k", linewidth=2.5, label=f"AP {mean_valid(table[:, valid]):.2f}  {who}")
-            axes.legend(loc="lower left" if len(valid) == 1 else "best", fontsize=9)
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, fontsize=9, frameon=False)
         title = f"masks, IoU ≥ {iou:g}" if valid else "no objects"
-        axes.set(title=title, xlabel="recall: share of the objects found", xlim=(0, 1), ylim=(0, 1.02))
+        axes.set(title=title, xlabel="recall: share of the objects found", xlim=(0, 1), ylim=(-0.02, 1.02))
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("precision, the best at this recall or higher")
     return _png(figure)
@@ -61,41 +63,47 @@ def plot_calibration(results: Results) -> bytes:
     axes.scatter(quality, true, s=14, alpha=0.4, linewidths=0, label="a detection")
     bins = np.minimum((quality * _BINS).astype(int), _BINS - 1)
     means = np.array([(quality[bins == b].mean(), true[bins == b].mean()) for b in np.unique(bins)]).reshape(-1, 2)
-    axes.plot(*means.T, "o-", color="C3", linewidth=2, label=f"mean per {1 / _BINS:g} of quality")
+    axes.plot(*means.T, "o-", color="C3", linewidth=2, label=f"mean per {1 / _BINS:g} of quality (their number)")
+    for (x, y), count in zip(means, np.unique(bins, return_counts=True)[1], strict=True):
+        axes.annotate(
+            str(count), (x, y), (0, 8), textcoords="offset points", ha="center", color="C3", fontweight="bold"
+        )
     spearman, error = (results.scores[f"quality_{name}"] for name in ("spearman", "error"))
     title = f"{len(quality)} detections of class score ≥ {CERTAIN:g}\n"
     axes.set_title(title + f"Spearman {_number(spearman)}, mean error {_number(error)}")
     axes.set(xlabel="predicted quality", ylabel="true mask IoU with the object it fits best", aspect="equal")
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize=9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, fontsize=9, frameon=False)
     return _png(figure)
 
 
 def plot_confusion(counts: NDArray[np.int64], names: Sequence[str]) -> bytes:
     """A confusion matrix as `matching.confusion_matrix` counts it. names: of the C classes, see `class_names`."""
+    from matplotlib import colormaps
+
     classes = len(names)
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     mistakes = counts.sum(axis=0)[:-1] + counts.sum(axis=1)[:-1] - 2 * np.diag(counts)[:-1]
     shown = sorted(np.argsort(-mistakes, kind="stable")[:_CELLS])
     cells = [*shown, classes]
     counts, share = counts[np.ix_(cells, cells)], share[np.ix_(cells, cells)]
-    side = 4.2 + 0.5 * len(cells)
+    side = 3.2 + 0.55 * len(cells)
     figure = _figure(side + 0.6, side)
     axes = figure.subplots()
-    image = axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-    figure.colorbar(image, label="share of the row", shrink=0.8)
+    wrong = ~np.eye(len(cells), dtype=np.bool_)
+    axes.imshow(np.where(wrong[..., None], colormaps["Reds"](0.9 * share), colormaps["Blues"](0.9 * share)))
     for (i, j), count in np.ndenumerate(counts):
-        if count or len(cells) <= _CURVES + 1:
-            text = "" if i == j == len(shown) else f"{count}\n{100 * share[i, j]:.0f} %" if classes < 7 else f"{count}"
-            axes.text(j, i, text, ha="center", va="center", color="white" if share[i, j] > 0.5 else "black", fontsize=8)
+        if (i, j) != (len(shown), len(shown)) and (count or classes < 7):
+            text = f"{count}\n{100 * share[i, j]:.0f} %" if classes < 7 and i < len(shown) else f"{count}"
+            axes.text(j, i, text, ha="center", va="center", color="white" if share[i, j] > 0.5 else "black", fontsize=9)
     labels = [names[i] for i in shown]
     axes.set_xticks(range(len(cells)), [*labels, "(missed)"], rotation=45, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(cells)), [*labels, "(false)"])
+    axes.set_yticks(range(len(cells)), [*labels, "(no object)"])
     axes.set(xlabel="predicted class", ylabel="true class")
-    title = f"class score ≥ {CERTAIN:g}, mask IoU ≥ {MATCH_IOU:g}"
+    title = f"class score ≥ {CERTAIN:g}, mask IoU ≥ {MATCH_IOU:g}\nblue right, red wrong; colour: share of the row"
     fewer = f"\nthe {len(shown)} of {classes} classes with the most mistakes" if len(shown) < classes else ""
-    axes.set_title(title + fewer, fontsize=11)
+    axes.set_title(title + fewer, fontsize=10)
     return _png(figure)
 
 
@@ -103,43 +111,45 @@ def plot_log(log: Path) -> bytes:
     """Training losses, per logged step and as each epoch's mean, and validation scores over epochs, from Lightning's
     metrics.csv. A resumed training's file holds what came after."""
     series = _read_log(log)
-    figure = _figure(14, 9)
-    losses, precision, others, per_class = figure.subplots(2, 2).ravel()
-    for k, (name, points) in enumerate(_chosen(series, "train/").items()):
-        points = points[points[:, 1] > 0]  # a loss without a sample is 0, which a logarithm cannot show
-        epochs = np.ceil(points[:, 0] - 1e-9)
-        means = np.array([(e, points[epochs == e, 1].mean()) for e in np.unique(epochs)]).reshape(-1, 2)
-        losses.plot(*points.T, color=f"C{k}", alpha=0.25, linewidth=1)
-        losses.plot(*means.T, "o-", color=f"C{k}", markersize=3, linewidth=3 if name == "loss" else 1.5, label=name)
-    if losses.lines:
-        losses.set_yscale("log")
     scores = _chosen(series, "val/")
+    classes = _chosen(scores, "segm_AP/")
+    rest = {name: points for name, points in scores.items() if not name.startswith("segm_AP/")}
+    figure = _figure(14, 8.5) if classes else _figure(20, 4.8)
+    axes = figure.subplots(2, 2).ravel() if classes else figure.subplots(1, 3)
+    _plot_losses(axes[0], _chosen(series, "train/"))
     for prefix, (kind, colour) in _KINDS.items():
         for suffix, (which, style) in _STYLES.items():
-            points = scores.pop(f"{prefix}_{suffix}", np.zeros((0, 2)))
-            precision.plot(*points.T, style, color=colour, marker="o", markersize=3, label=f"{kind} {which}")
-    classes = [name for name in scores if name.startswith("segm_AP/")]
-    for name in classes if len(classes) <= 2 * _CURVES else []:
-        label = name.removeprefix("segm_AP/")[:_NAME].replace("$", r"\$")
-        per_class.plot(*scores[name].T, "o-", markersize=3, label=f"AP {scores[name][-1, 1]:.2f}  {label}")
-    for name in [name for name in scores if name not in classes]:
-        others.plot(*scores[name].T, "o-", markersize=3, label=name)
-    _finish(losses, "training losses, pale: per step, bold: mean of the epoch", "loss")
-    _finish(precision, "validation: COCO AP", "AP", (0, 1))
-    _finish(others, "validation: overlaps and quality", "score", (min(0, others.get_ylim()[0]), 1))
-    _finish(per_class, "validation: mask AP per class", "AP", (0, 1))
-    if not per_class.lines:
-        per_class.remove()
+            points = rest.pop(f"{prefix}_{suffix}", np.zeros((0, 2)))
+            axes[1].plot(*points.T, style, color=colour, marker="o", markersize=3, label=f"{kind} {which}")
+    for name, points in rest.items():
+        axes[2].plot(*points.T, "o-", markersize=3, label=name)
+    for name, points in sorted(classes.items(), key=lambda item: -item[1][-1, 1])[: 2 * _CURVES]:
+        axes[3].plot(*points.T, "o-", markersize=3, label=f"{points[-1, 1]:.2f} {_short(name)}")
+    titles = ("COCO AP", "overlaps and quality", "mask AP per class")
+    end = max((points[-1, 0] for points in series.values()), default=1.0)
+    for k, panel in enumerate(axes):
+        title = f"validation: {titles[k - 1]}" if k else "training losses (pale: steps, bold: epoch's mean)"
+        panel.set(title=title, xlabel="epochs", ylabel="score" if k else "loss", xlim=(0, 1.02 * end))
+        panel.grid(alpha=0.3, which="both")
+        if k:
+            panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
+        if panel.lines:
+            panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9, frameon=False)
     return _png(figure)
 
 
-def _finish(axes: Any, title: str, unit: str, limits: tuple[float, float] | None = None) -> None:
-    axes.set(title=title, xlabel="epochs", ylabel=unit)
-    axes.grid(alpha=0.3, which="both")
-    if limits is not None:
-        axes.set_ylim(*limits)
-    if axes.lines:
-        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9, frameon=False)
+def _plot_losses(axes: Any, losses: Mapping[str, NDArray[np.float64]]) -> None:
+    lowest = np.inf
+    for k, (name, points) in enumerate(losses.items()):
+        epochs = np.ceil(points[:, 0] - 1e-9)
+        means = np.array([points[epochs == epoch].mean(axis=0) for epoch in np.unique(epochs)]).reshape(-1, 2)
+        means, points = (values[values[:, 1] > 0] for values in (means, points))  # a logarithm has no place for 0
+        axes.plot(*points.T, color=f"C{k}", alpha=0.25, linewidth=1)
+        axes.plot(*means.T, "o-", color=f"C{k}", markersize=3, linewidth=3 if name == "loss" else 1.5, label=name)
+        lowest = min(lowest, means[:, 1].min(initial=np.inf))
+    if np.isfinite(lowest):
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.3 * lowest)
 
 
 def _chosen(series: Mapping[str, NDArray[np.float64]], prefix: str) -> dict[str, NDArray[np.float64]]:

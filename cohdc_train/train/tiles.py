@@ -1,5 +1,6 @@
 """Validation images beside each other: truth, prediction, and a list of what was found (OpenCV)."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ _PANEL = (300, 400)  # px, height and width of truth and of prediction
 _LIST = 250  # px, width
 _LINE = 18  # px, height of a line of text
 _GAP = 6  # px
+_NUMBER = (20, 14)  # px, width and height
 _FILL = 0.35
 # BGR, of objects found as the right class; red and orange are kept for mistakes
 _COLOURS: tuple[Colour, ...] = ((75, 180, 60), (230, 160, 30), (240, 240, 70), (200, 60, 160), (90, 220, 220))
@@ -51,7 +53,7 @@ def draw_tiles(
 
 
 class _Entry(NamedTuple):
-    """A line of the list, and what is drawn for it."""
+    """A line of the list, and what carries its number. Misses have none: they share a line per class."""
 
     text: str
     colour: Colour
@@ -65,14 +67,16 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
     entries = _entries(match, names)
     for row in match.crowds:
         tint(truth, _mask(row, truth), _CROWD, _FILL)
+    for missed in match.missed():
+        tint(truth, _mask(missed, truth), _MISTAKE, _FILL)
     _draw(truth, [(entry.object, entry.colour) for entry in entries])
     _draw(predicted, [(entry.detection, entry.colour) for entry in entries])
     right = int(match.right.sum())
-    counts = f"{len(match.objects)} objects, {right} found, {len(match.detections) - right} false"
+    counts = f"objects {len(match.objects)}, found {right}, false {len(match.detections) - right}"
     head = _paper(_LINE, 2 * _PANEL[1] + _LIST + 3 * _GAP)
     _write(head, f"score {match.score:.2f}   {counts}   {image.path.name}", (_GAP, _LINE - 5), _INK, 0.45)
     gap = _paper(_PANEL[0], _GAP)
-    body = np.hstack([gap, _centred(truth), gap, _centred(predicted), gap, _list(entries)])
+    body = np.hstack([gap, _centred(truth), gap, _centred(predicted), gap, _list(match, entries, names)])
     return np.vstack([head, body, _paper(_GAP, body.shape[1])])
 
 
@@ -82,20 +86,20 @@ def _draw(shown: Image, rows: Sequence[tuple[Row | None, Colour]]) -> None:
     for mask, (_, colour) in zip(masks, rows, strict=True):
         if mask is not None:
             tint(shown, mask, colour, _FILL)
+    taken: list[tuple[int, int]] = []
     for number, mask in enumerate(masks, start=1):
-        if mask is not None:
-            _write_number(shown, str(number), mask)
+        if mask is not None and mask.any():
+            taken.append(_free_place(mask, taken))
+            write_outlined(shown, str(number), taken[-1], 0.5)
 
 
 def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
-    """What was found, then misses, then false detections."""
+    """What was found, then false detections."""
     found: list[_Entry] = []
-    missed: list[_Entry] = []
     for j, (i, o) in enumerate(match.pairs()):
-        name = names[o["category_id"] - 1]
         if i < 0:
-            missed.append(_Entry(f"{name} missed", _MISTAKE, o, None))
             continue
+        name = names[o["category_id"] - 1]
         detection = match.detections[i]
         colour = _COLOURS[len(found) % len(_COLOURS)] if match.right[j] else _WRONG_CLASS
         seen = names[detection["category_id"] - 1]
@@ -107,17 +111,19 @@ def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
             overlap = match.overlaps[i].max(initial=0.0)
             text = f"{names[row['category_id'] - 1]} {_values(row)} IoU {overlap:.2f} false"
             false.append(_Entry(text, _MISTAKE, None, row))
-    return found + missed + false
+    return found + false
 
 
 def _values(row: Row) -> str:
     return f"{row['score']:.2f} q {row['quality']:.2f}"
 
 
-def _list(entries: Sequence[_Entry]) -> Image:
+def _list(match: ImageMatch, entries: Sequence[_Entry], names: Sequence[str]) -> Image:
     shown = _paper(_PANEL[0], _LIST)
     room = _PANEL[0] // _LINE
-    lines = [(f"{number} {entry.text}", entry.colour) for number, entry in enumerate(entries, start=1)]
+    missed = Counter(names[row["category_id"] - 1] for row in match.missed())
+    lines = [(f"missed: {count} {name}", _MISTAKE) for name, count in missed.items()]
+    lines += [(f"{number} {entry.text}", entry.colour) for number, entry in enumerate(entries, start=1)]
     if len(lines) > room:
         lines[room - 1 :] = [(f"and {len(lines) - room + 1} more", _INK)]
     for k, (text, colour) in enumerate(lines):
@@ -131,13 +137,18 @@ def _mask(row: Row, shown: Image) -> Image:
     return np.asarray(cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
-def _write_number(shown: Image, text: str, mask: Image) -> None:
-    """Where the mask is widest."""
+def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """(x, y) of a number's lower left corner: where the mask is widest, or below when a number stands there."""
     depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    if depth.max() > 0:
-        y, x = np.unravel_index(int(depth.argmax()), depth.shape)
-        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
-        write_outlined(shown, text, (int(x) - width // 2, int(y) + height // 2))
+    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+    width, height = _NUMBER
+    x = min(max(int(column) - width // 2, 0), max(mask.shape[1] - width, 0))
+    y = min(max(int(row) + height // 2, height), mask.shape[0] - 1)
+    for _ in range(mask.shape[0] // height):
+        if not any(abs(x - left) < width and abs(y - bottom) < height for left, bottom in taken):
+            break
+        y = y + height if y + height < mask.shape[0] else height
+    return x, y
 
 
 def _centred(shown: Image) -> Image:
