@@ -131,6 +131,7 @@ def plot_log(log: Path) -> bytes:
         title = f"validation: {titles[k - 1]}" if k else "training losses (pale: steps, bold: epoch's mean)"
         panel.set(title=title, xlabel="epochs", ylabel="score" if k else "loss", xlim=(0, 1.02 * end))
         panel.grid(alpha=0.3, which="both")
+        panel.xaxis.get_major_locator().set_params(integer=True)
         if k:
             panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
         if panel.lines:

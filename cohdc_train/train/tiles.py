@@ -81,16 +81,17 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
 
 
 def _draw(shown: Image, rows: Sequence[tuple[Row | None, Colour]]) -> None:
-    """Masks, then on top of them their numbers, which count the entries from 1."""
+    """Masks, then on top of them their numbers, where there is room; they count the entries from 1."""
     masks = [None if row is None else _mask(row, shown) for row, _ in rows]
     for mask, (_, colour) in zip(masks, rows, strict=True):
         if mask is not None:
             tint(shown, mask, colour, _FILL)
     taken: list[tuple[int, int]] = []
     for number, mask in enumerate(masks, start=1):
-        if mask is not None and mask.any():
-            taken.append(_free_place(mask, taken))
-            write_outlined(shown, str(number), taken[-1], 0.5)
+        place = None if mask is None or not mask.any() else _free_place(mask, taken)
+        if place is not None:
+            taken.append(place)
+            write_outlined(shown, str(number), place, 0.5)
 
 
 def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
@@ -137,18 +138,18 @@ def _mask(row: Row, shown: Image) -> Image:
     return np.asarray(cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
-def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """(x, y) of a number's lower left corner: where the mask is widest, or below when a number stands there."""
+def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
+    """(x, y) of a number's lower left corner: where the mask is widest, or just below or above when a number stands
+    there; None when there too."""
     depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     width, height = _NUMBER
     x = min(max(int(column) - width // 2, 0), max(mask.shape[1] - width, 0))
-    y = min(max(int(row) + height // 2, height), mask.shape[0] - 1)
-    for _ in range(mask.shape[0] // height):
+    for shift in (0, 1, -1):
+        y = min(max(int(row) + height // 2 + shift * height, height), mask.shape[0] - 1)
         if not any(abs(x - left) < width and abs(y - bottom) < height for left, bottom in taken):
-            break
-        y = y + height if y + height < mask.shape[0] else height
-    return x, y
+            return x, y
+    return None
 
 
 def _centred(shown: Image) -> Image:
