@@ -129,11 +129,14 @@ def plot_log(log: Path) -> bytes:
     end = max((points[-1, 0] for points in series.values()), default=1.0)
     for k, panel in enumerate(axes):
         title = f"validation: {titles[k - 1]}" if k else "training losses (pale: steps, bold: epoch's mean)"
+        if not panel.lines:
+            title += "\nnone in the log" + ("" if k else ", which has every trainer.log_every_n_steps-th step")
         panel.set(title=title, xlabel="epochs", ylabel="score" if k else "loss", xlim=(0, 1.02 * end))
         panel.grid(alpha=0.3, which="both")
         panel.xaxis.get_major_locator().set_params(integer=True)
-        if k:
-            panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
+        if k and np.isfinite(panel.dataLim.height):
+            low, high = min(0.0, panel.dataLim.y0), max(0.1, panel.dataLim.y1)
+            panel.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
         if panel.lines:
             panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9, frameon=False)
     return _png(figure)
