@@ -21,6 +21,7 @@ from cohdc_train.presets import config_path
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.ema import ema
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.train.pictures import ValidationPictures, draw_validation, write_files
 
 _USAGE = "cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR] [--print_config] [--OPTION VALUE ...]"
 _DESCRIPTION = "Train an HDC Mask R-CNN with CQE on COCO-format data."
@@ -39,7 +40,8 @@ _ADVICE = (
 def fit(args: list[str]) -> Trainer:
     """Train: `cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR]`; writes below `--out`:
 
-    `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved), `logs/version_N/` (CSV, TensorBoard).
+    `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved), `logs/version_N/` (CSV, TensorBoard),
+    `pictures/` (of best.ckpt; `pictures/last/` of the last validation; none with `--pictures false`).
     Raises CohdcError in one line for whatever the user can mend; a wrong key ends the program with code 2.
     """
     with _told_in_one_line():
@@ -75,6 +77,7 @@ def score(
     workers: int = 1,
     precision: str = "32-true",
     canvas: tuple[int, int] | None = None,
+    pictures: Path | None = None,
 ) -> dict[str, float]:
     """Print a checkpoint's scores on the validation split of a COCO-format folder.
 
@@ -88,6 +91,7 @@ def score(
         workers: processes that read images.
         precision: Lightning's precision, such as bf16-mixed.
         canvas: height and width in px to fit images into; the training's when not given.
+        pictures: folder for best.jpg, worst.jpg, pr_curves.png, calibration.png and confusion.png.
     """
     module = MaskRCNNModule.load(checkpoint, canvas)
     module.rescore = module.rescore if rescore is None else rescore
@@ -103,6 +107,8 @@ def score(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, results)
+    if pictures is not None and module.results is not None:
+        write_files(pictures, draw_validation(module.results, data.folder.val.images))
     return results
 
 
@@ -116,6 +122,7 @@ class FitCommand(LightningCLI):
         parser.add_argument(
             "--ema", type=float, default=0.0, help="decay of the weights' moving average, such as .999; 0: none"
         )
+        parser.add_argument("--pictures", type=bool, default=True, help="draw every validation, in OUT/pictures")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults(
             {
@@ -148,7 +155,9 @@ class FitCommand(LightningCLI):
         bar = [] if config["enable_progress_bar"] is False else [RichProgressBar(leave=True)]
         last = _keep_last(Path(self.config["out"]))
         averaged = [ema(self.config["ema"])] if self.config["ema"] else []
-        kwargs["callbacks"] = [*bar, last, *averaged, *(given if isinstance(given, list) else [given])]
+        wanted = self.config["pictures"] and not config["fast_dev_run"]
+        pictures = [ValidationPictures(Path(self.config["out"]) / "pictures")] if wanted else []
+        kwargs["callbacks"] = [*bar, last, *averaged, *pictures, *(given if isinstance(given, list) else [given])]
         return super().instantiate_trainer(**kwargs)
 
     def run(self) -> None:

@@ -3,6 +3,7 @@ Table 4), and how well CQE's quality tells the true IoU."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,8 @@ from cohdc_train.masks import paste_roi_mask
 MATCH_IOU = 0.5  # mask IoU from which a detection counts as having found an object
 HIGH_QUALITY = 0.9  # S > 90
 CERTAIN = 0.5  # class score from which a detection counts for the quality's calibration
+IOUS = np.linspace(0.5, 0.95, 10)  # COCO's thresholds
+RECALLS = np.linspace(0.0, 1.0, 101)  # COCO's recalls, at which it takes the precision
 _MAX_DETECTIONS = 100  # per image, COCO's
 
 Row = dict[str, Any]
@@ -49,6 +52,25 @@ def encode(image_id: int, size: tuple[int, int], detections: Mapping[str, Tensor
     return rows
 
 
+@dataclass(frozen=True)
+class Results:
+    """What one validation found, over every process: what its scores, and pictures of it, are made of.
+
+    Attributes:
+        truth: the ground truth's COCO dict, with the images seen.
+        rows: `encode`'s rows of all detections.
+        kept: those of `rows` that the scores count, by `min_quality`.
+        precision: [IOUS, RECALLS, C] of masks, as `precision_table` gives it.
+        scores: name -> value.
+    """
+
+    truth: Mapping[str, Any]
+    rows: list[Row]
+    kept: list[Row]
+    precision: NDArray[np.float64]
+    scores: dict[str, float]
+
+
 class SegmentationMetrics:
     """Collects detections image by image and scores them against a COCO dict.
 
@@ -71,7 +93,11 @@ class SegmentationMetrics:
         self._seen[image_id] = encode(image_id, self._sizes[image_id], detections)
 
     def compute(self) -> dict[str, float]:
-        """Scores over every image seen by any process.
+        """The scores of `results`."""
+        return self.results().scores
+
+    def results(self) -> Results:
+        """Score every image seen by any process; every process must call it.
 
         {segm,boundary,box}_{AP,AP50,AP70}, mIoU, S90_matched, S90_all, quality_{spearman,error}, and with several
         classes segm_AP/NAME of each that has objects. A score whose denominator is empty (no object, no match) is nan.
@@ -82,15 +108,14 @@ class SegmentationMetrics:
         rows = [row for row in everything if row["quality"] >= self.min_quality]
         boxes = [{k: row[k] for k in ("image_id", "category_id", "score", "bbox")} for row in rows]
         masks = [_mask_row(row, self.rescore) for row in rows]
-        scores: dict[str, float] = {}
-        kinds: tuple[tuple[str, Kind, list[Row]], ...]
-        kinds = (("segm", "segm", masks), ("boundary", "boundary", masks), ("box", "bbox", boxes))
+        precision = precision_table(truth, masks, "segm")
+        scores = {f"segm_{name}": value for name, value in _averages(truth, precision).items()}
+        kinds: tuple[tuple[str, Kind, list[Row]], ...] = (("boundary", "boundary", masks), ("box", "bbox", boxes))
         for prefix, kind, results in kinds:
-            precision = average_precision(truth, results, kind)
-            if kind != "segm":
-                precision = {name: value for name, value in precision.items() if "/" not in name}
-            scores.update({f"{prefix}_{name}": value for name, value in precision.items()})
-        return {**scores, **overlap_scores(match_masks(truth, masks)), **calibration(truth, everything)}
+            averages = average_precision(truth, results, kind)
+            scores.update({f"{prefix}_{name}": value for name, value in averages.items() if "/" not in name})
+        scores |= overlap_scores(match_masks(truth, masks)) | calibration(truth, everything)
+        return Results(truth, everything, rows, precision, scores)
 
 
 def average_precision(ground_truth: Mapping[str, Any], results: Sequence[Row], kind: Kind) -> dict[str, float]:
@@ -100,19 +125,27 @@ def average_precision(ground_truth: Mapping[str, Any], results: Sequence[Row], k
     IoU (Cheng et al. 2021, band of 2 % of the image's diagonal). Crowd objects are ignored as COCO does; at most 100
     detections per image. nan without any object.
     """
+    return _averages(ground_truth, precision_table(ground_truth, results, kind))
+
+
+def precision_table(ground_truth: Mapping[str, Any], results: Sequence[Row], kind: Kind) -> NDArray[np.float64]:
+    """COCO's precision [IOUS, RECALLS, C]: the best that is reached at this recall or a higher one; -1 in a class
+    without objects. Arguments as in `average_precision`."""
     truth = COCO({key: list(ground_truth[key]) for key in ("images", "categories", "annotations")})
     evaluation = COCOeval_faster(truth, truth.loadRes([dict(row) for row in results]), kind, print_function=_silent)
     evaluation.evaluate()
     evaluation.accumulate()
-    precision = np.asarray(evaluation.eval["precision"])[:, :, :, 0, -1]  # [IoU, recall, class], all areas
-    thresholds = np.asarray(evaluation.params.iouThrs)
+    return np.asarray(evaluation.eval["precision"])[:, :, :, 0, -1]  # all areas, all detections
+
+
+def _averages(ground_truth: Mapping[str, Any], precision: NDArray[np.float64]) -> dict[str, float]:
     names = [row["name"] for row in sorted(ground_truth["categories"], key=lambda row: row["id"])]
-    per_class = {f"AP/{name}": _mean_valid(precision[:, :, i]) for i, name in enumerate(names) if len(names) > 1}
+    per_class = {f"AP/{name}": mean_valid(precision[:, :, i]) for i, name in enumerate(names) if len(names) > 1}
     return {
         **{name: value for name, value in per_class.items() if not np.isnan(value)},
-        "AP": _mean_valid(precision),
-        "AP50": _mean_valid(precision[np.isclose(thresholds, 0.5)]),
-        "AP70": _mean_valid(precision[np.isclose(thresholds, 0.7)]),
+        "AP": mean_valid(precision),
+        "AP50": mean_valid(precision[np.isclose(IOUS, 0.5)]),
+        "AP70": mean_valid(precision[np.isclose(IOUS, 0.7)]),
     }
 
 
@@ -130,20 +163,13 @@ def match_masks(ground_truth: Mapping[str, Any], results: Iterable[Row]) -> NDAr
 
 
 def calibration(ground_truth: Mapping[str, Any], rows: Iterable[Row]) -> dict[str, float]:
-    """How well `quality` tells the true mask IoU, over detections of class score .5 and more (`encode`'s rows).
+    """How well `quality` tells the true mask IoU, over `quality_pairs`.
 
-    The true IoU is the largest with an object of the same image and class, crowds left out. quality_spearman: rank
-    correlation; quality_error: mean absolute difference. nan where there are fewer than three, or all the same.
+    quality_spearman: rank correlation; quality_error: mean absolute difference. nan where there are fewer than three,
+    or all the same.
     """
-    objects = _objects(ground_truth)
-    pairs = []
-    for row in rows:
-        if row["score"] >= CERTAIN:
-            shapes = objects.get((row["image_id"], row["category_id"]), [])
-            overlap = rle.iou([row["segmentation"]], shapes, [0] * len(shapes)) if shapes else np.zeros(1)
-            pairs.append((row["quality"], float(np.max(overlap))))
-    quality, true = np.array(pairs).reshape(-1, 2).T
-    if len(pairs) < 3:
+    quality, true = quality_pairs(ground_truth, rows).T
+    if len(quality) < 3:
         return {"quality_spearman": np.nan, "quality_error": np.nan}
     ranked = np.ptp(quality) > 0 and np.ptp(true) > 0
     return {
@@ -152,13 +178,28 @@ def calibration(ground_truth: Mapping[str, Any], rows: Iterable[Row]) -> dict[st
     }
 
 
+def quality_pairs(ground_truth: Mapping[str, Any], rows: Iterable[Row]) -> NDArray[np.float64]:
+    """[n, 2] quality and true mask IoU of the detections of class score .5 and more (`encode`'s rows).
+
+    The true IoU is the largest with an object of the same image and class, crowds left out; 0 without one.
+    """
+    objects = _objects(ground_truth)
+    pairs = []
+    for row in rows:
+        if row["score"] >= CERTAIN:
+            shapes = objects.get((row["image_id"], row["category_id"]), [])
+            overlap = rle.iou([row["segmentation"]], shapes, [0] * len(shapes)) if shapes else np.zeros(1)
+            pairs.append((row["quality"], float(np.max(overlap))))
+    return np.array(pairs).reshape(-1, 2)
+
+
 def _objects(ground_truth: Mapping[str, Any]) -> dict[tuple[int, int], list[Any]]:
     """(image id, category id) -> compressed RLE of its objects that are no crowd."""
     sizes = {image["id"]: (image["height"], image["width"]) for image in ground_truth["images"]}
     objects: dict[tuple[int, int], list[Any]] = defaultdict(list)
     for row in ground_truth["annotations"]:
         if not row["iscrowd"]:
-            shape = _to_rle(row["segmentation"], sizes[row["image_id"]])
+            shape = to_rle(row["segmentation"], sizes[row["image_id"]])
             objects[row["image_id"], row["category_id"]].append(shape)
     return objects
 
@@ -205,7 +246,8 @@ def _encode_mask(mask: NDArray[np.bool_]) -> Any:
     return {"size": list(encoded["size"]), "counts": encoded["counts"].decode()}
 
 
-def _to_rle(segmentation: Any, size: tuple[int, int]) -> Any:
+def to_rle(segmentation: Any, size: tuple[int, int]) -> Any:
+    """Polygons, in px, or compressed RLE -> compressed RLE. size: (height, width) px."""
     if isinstance(segmentation, dict):
         return segmentation
     return rle.merge(rle.frPyObjects(segmentation, *size))
@@ -229,7 +271,8 @@ def _gather(seen: dict[int, list[Row]]) -> dict[int, list[Row]]:
     return {image_id: rows for part in parts for image_id, rows in part.items()}
 
 
-def _mean_valid(precision: NDArray[np.float64]) -> float:
+def mean_valid(precision: NDArray[np.float64]) -> float:
+    """Mean over the classes that have objects; nan where there is none."""
     valid = precision[precision > -1]  # -1 marks classes without objects
     return float(valid.mean()) if valid.size else np.nan
 

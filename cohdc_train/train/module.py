@@ -13,7 +13,7 @@ from torch import Tensor
 from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
-from cohdc_train.train.metrics import SegmentationMetrics
+from cohdc_train.train.metrics import Results, SegmentationMetrics
 from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer
 
 MIN_CANVAS = 32  # px: one cell of the coarsest level that RoIs are pooled from
@@ -55,6 +55,7 @@ class MaskRCNNModule(pl.LightningModule):
         )
         self.network = MaskRCNN(len(self.class_names), self.network_config)
         self._metrics: SegmentationMetrics | None = None
+        self.results: Results | None = None  # of the last validation
 
     @classmethod
     def load(cls, path: Path, canvas: tuple[int, int] | None = None) -> "MaskRCNNModule":
@@ -106,7 +107,8 @@ class MaskRCNNModule(pl.LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Log the scores under `val/`."""
         assert self._metrics is not None
-        for name, value in self._metrics.compute().items():
+        self.results = self._metrics.results()
+        for name, value in self.results.scores.items():
             self.log(f"val/{name}", value, prog_bar=name == "segm_AP50", sync_dist=True)
         self._metrics = None
 

@@ -23,6 +23,7 @@ model:
   network: {depth: 18, width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16,
             proposals: [50, 20]}
 trainer: {accelerator: cpu, max_epochs: 1, enable_model_summary: false}
+pictures: false
 """
 
 
@@ -184,6 +185,7 @@ def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> 
     shown: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
     assert shown["data"]["canvas"] == [800, 1024]
     assert shown["checkpoint"]["monitor"] == "val/segm_AP"
+    assert shown["pictures"] is True
 
 
 def test_an_average_of_the_weights_is_validated_and_kept(toy: Path, run: Path, tmp_path: Path) -> None:
