@@ -87,7 +87,19 @@ class NetworkConfig:
             raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
 
 
-class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]  # torchvision is not typed
+class PreciseRPNHead(RPNHead):  # type: ignore[misc]  # torchvision is not typed
+    """Torchvision's RPN head, whose outputs are float32 also in mixed precision.
+
+    Torchvision gives its proposals the type of the deltas: in bfloat16 they, and the true boxes that join them, would
+    lie on a grid of 2 px at the 300th pixel.
+    """
+
+    def forward(self, x: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        logits, deltas = super().forward(x)
+        return [one.float() for one in logits], [one.float() for one in deltas]
+
+
+class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
     """Torchvision's RPN, for which a background anchor inside a crowd box is no negative."""
 
     def assign_targets_to_anchors(
@@ -250,7 +262,7 @@ def _build_rpn(config: NetworkConfig) -> CrowdAwareRPN:
     anchors = AnchorGenerator(
         tuple((scale,) for scale in config.anchor_scales), ((0.5, 1.0, 2.0),) * len(config.anchor_scales)
     )
-    head = RPNHead(config.fpn_channels, anchors.num_anchors_per_location()[0])
+    head = PreciseRPNHead(config.fpn_channels, anchors.num_anchors_per_location()[0])
     top = {"training": config.proposals[0], "testing": config.proposals[1]}
     return CrowdAwareRPN(anchors, head, 0.7, 0.3, 256, 0.5, {k: 2 * n for k, n in top.items()}, top, 0.7)
 

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
+from torchvision.models.detection.image_list import ImageList
 from torchvision.ops import box_iou
 
 from cohdc_train.models import Detector, MaskRCNN, NetworkConfig, detect
@@ -128,6 +129,21 @@ def test_the_target_of_the_quality_changes_its_loss_and_nothing_else(small_confi
     assert len({iou, ciou, boundary}) == 3
     assert smaller in (iou, boundary)
     assert len({loss["mask"].item() for loss in losses}) == 1
+
+
+def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
+    """In bfloat16 a box of one pixel at x = 901 has no width, and its regression no logarithm."""
+    torch.manual_seed(0)
+    network = MaskRCNN(1, dataclasses.replace(small_config, canvas=(96, 1024)))
+    targets = [_target([[901, 60, 902, 61], [301, 10, 352, 51]], (96, 1024))]
+    with torch.autocast("cpu", torch.bfloat16):
+        losses = network.losses(torch.rand(1, 3, 96, 1024), targets)
+        features = network.features(torch.rand(1, 3, 96, 1024))
+        proposals, _ = network.rpn(ImageList(torch.rand(1, 3, 96, 1024), [(96, 1024)]), features, targets)
+        sampled, _, _, _ = network._sample(proposals, targets)
+    assert all(torch.isfinite(loss) for loss in losses.values())
+    assert sampled[0].dtype == torch.float32
+    assert (sampled[0] == targets[0]["boxes"][0]).all(dim=1).any()
 
 
 def test_masks_of_56_cells_train_and_are_given(small_config):
