@@ -211,3 +211,34 @@ def test_the_batch_size_is_found(toy: Path, tmp_path: Path, capsys: pytest.Captu
     assert "batch size: 32" in capsys.readouterr().out
     with pytest.raises(CohdcError, match="works on one device"):
         fit(arguments(toy, tmp_path, "--data.batch_size=auto", "--trainer.devices=2"))
+
+
+@pytest.mark.slow
+def test_two_pictures_are_learnt_by_heart(tmp_path: Path) -> None:
+    """Trained and scored on the same two images, every object is found: the whole way from JSON to AP is sound."""
+    root = coco_toys.folder(tmp_path, train=2)
+    (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
+    same = [f"--data.paths.{split}_{kind}" for split in ("train", "val") for kind in ("json", "images")]
+    places = [root / "instances_train.json", root / "images"] * 2
+    trainer = fit(
+        [
+            "--config",
+            str(tmp_path / "tiny.yaml"),
+            *(f"{name}={place}" for name, place in zip(same, places, strict=True)),
+            f"--out={tmp_path / 'run'}",
+            "--model.network.width=0.25",
+            "--model.network.fpn_channels=16",
+            "--model.network.fc=32",
+            "--model.optimizer.lr=0.004",
+            "--data.canvas=[96,128]",
+            "--trainer.enable_progress_bar=false",
+            "--data.augment.flip=0",
+            "--data.augment.scale_jitter=[1,1]",
+            "--data.augment.photometric=false",
+            "--trainer.max_epochs=150",
+            "--trainer.check_val_every_n_epoch=150",
+        ]
+    )
+    assert trainer.callback_metrics["val/segm_AP50"] == 1.0
+    assert trainer.callback_metrics["val/box_AP50"] == 1.0
+    assert trainer.callback_metrics["val/mIoU"] > 0.8
