@@ -117,7 +117,7 @@ def test_gradients_that_are_not_averaged_show(root: Path, one: Any) -> None:
     apart = fit(root, root / "apart", processes=2, batch_size=2, apart=True)
     off = (curve(apart) / curve(one) - 1).abs()
     assert off[0] < TOLERANCE
-    assert off[1:].max() > 10 * TOLERANCE
+    assert off[1:].max() > 1e-3  # 1.2e-2 measured
     assert not all(torch.equal(weight, apart[1]["weights"][name]) for name, weight in apart[0]["weights"].items())
 
 
