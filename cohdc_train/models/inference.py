@@ -88,7 +88,9 @@ def _propose(network: MaskRCNN, features: list[Tensor], limit: Tensor) -> Tensor
     for level, (logits, delta) in enumerate(zip(objectness, deltas, strict=True)):
         score, index = _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
         stride = 4 * 2**level
-        anchors = _anchors(rpn.anchor_generator.cell_anchors[level].to(logits.device), index, logits.shape[3], stride)
+        # float32, whatever training in mixed precision left there: bfloat16 anchors above 256 px are off by up to 1 px
+        cell = rpn.anchor_generator.cell_anchors[level].to(logits.device, torch.float32)
+        anchors = _anchors(cell, index, logits.shape[3], stride)
         delta = _flatten(delta, 4).gather(1, index[:, :, None].expand(-1, -1, 4))
         box = _decode(delta.float(), anchors, (1.0, 1.0, 1.0, 1.0), limit)
         score = torch.where(_is_solid(box), score.float().sigmoid(), 0.0)

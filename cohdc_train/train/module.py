@@ -116,7 +116,7 @@ class MaskRCNNModule(pl.LightningModule):
 
     def setup(self, stage: str) -> None:
         """Weights with the channels last, as half-precision convolutions read them fastest; the values are the same."""
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network.to(memory_format=torch.channels_last)
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """The sum of the losses. Raises CohdcError naming step and images when it is not finite."""
