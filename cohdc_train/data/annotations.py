@@ -1,5 +1,6 @@
 """One annotation and one image of a COCO-format file, checked (numpy, pycocotools, OpenCV; no torch)."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pycocotools import mask as rle
 from cohdc_train.data.image_files import check_size
 from cohdc_train.errors import DataError
 
+_FAR = 1e5  # px from which a coordinate is a mistake; pycocotools draws such polygons point by point until memory ends
 _CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
 
 
@@ -73,13 +75,14 @@ def read_image(image: CocoImage) -> NDArray[np.uint8]:
 
 
 def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
-    """Polygons with at least three points, or a compressed RLE; empty when there is none."""
+    """Polygons that can be drawn, with at least three points each, or a compressed RLE; empty when there is none."""
     given = row.get("segmentation") or []
     try:
         if not isinstance(given, dict | list):
             raise TypeError("segmentation")
         if isinstance(given, list):
-            return [list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0]
+            parts = [list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0]
+            return [part for part in parts if all(abs(value) <= _FAR for value in part)]  # neither NaN nor infinite
         if list(given["size"]) != [image.height, image.width]:
             size = f"{image.height}x{image.width}"
             raise DataError(f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}")
@@ -134,7 +137,7 @@ def _decompressed(text: str) -> list[int]:
 def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
     """Why an annotation cannot be used; empty when it can."""
     box = row.get("bbox")
-    if box is not None and (len(box) != 4 or not _has_extent(_clip(box, image))):
+    if box is not None and not (_is_numbers(box, 4) and _has_extent(_clip(box, image))):
         return "degenerate box"
     if not segmentation:
         return "" if row.get("iscrowd") and box is not None else "no contour"
@@ -144,8 +147,11 @@ def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
 def build_object(row: dict[str, Any], label: int, segmentation: Any, image: CocoImage) -> CocoObject:
     """The object of a sound annotation; a missing box is taken from the contour."""
     box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
-    area = float(row.get("area") or box[2] * box[3])
-    return CocoObject(int(row.get("id", 0)), label, box, area, segmentation, bool(row.get("iscrowd", 0)))
+    area, number = row.get("area"), row.get("id")
+    area = float(area) if area and _is_numbers([area], 1) else box[2] * box[3]
+    return CocoObject(
+        number if isinstance(number, int) else 0, label, box, area, segmentation, bool(row.get("iscrowd", 0))
+    )
 
 
 def _extent(segmentation: Any) -> tuple[float, float, float, float]:
@@ -164,8 +170,18 @@ def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, 
     return x0, y0, x1 - x0, y1 - y0
 
 
+def _is_numbers(values: Any, count: int) -> bool:
+    listed = isinstance(values, list | tuple) and len(values) == count
+    return listed and all(isinstance(value, int | float) and math.isfinite(value) for value in values)
+
+
 def _has_extent(box: Sequence[float]) -> bool:
     return box[2] > 0 and box[3] > 0
+
+
+def lost_parts(row: dict[str, Any], segmentation: Any) -> int:
+    """How many polygons of an annotation `read_segmentation` left out beside those it kept."""
+    return len(row["segmentation"]) - len(segmentation) if isinstance(segmentation, list) and segmentation else 0
 
 
 def reaches_out(box: Sequence[float] | None, image: CocoImage) -> bool:

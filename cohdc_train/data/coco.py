@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from cohdc_train.data.annotations import CocoImage, CocoObject, build_object, defect, reaches_out, read_segmentation
+from cohdc_train.data.annotations import (
+    CocoImage,
+    CocoObject,
+    build_object,
+    defect,
+    lost_parts,
+    reaches_out,
+    read_segmentation,
+)
 from cohdc_train.data.layout import CocoPaths, SplitPaths, find_split, read_json
 from cohdc_train.errors import DataError
 
@@ -27,6 +35,7 @@ class CocoSplit:
         images: sorted by id.
         dropped: number of annotations left out, by reason.
         clipped: number of annotations that reached more than 1 px out of their image.
+        lost_parts: number of polygons left out of contours that have others.
     """
 
     name: str
@@ -35,6 +44,7 @@ class CocoSplit:
     images: tuple[CocoImage, ...]
     dropped: dict[str, int] = field(default_factory=dict)
     clipped: int = 0
+    lost_parts: int = 0
 
     def relabelled(self, class_names: Sequence[str]) -> "CocoSplit":
         """The same split under another order of the same names. Raises DataError when the names differ."""
@@ -66,6 +76,7 @@ class CocoSplit:
         """What reading left out or cut, counted, in one line; empty when nothing was."""
         parts = [f"{number} annotations dropped ({reason})" for reason, number in sorted(self.dropped.items())]
         parts += [f"{self.clipped} clipped to the image"] if self.clipped else []
+        parts += [f"{self.lost_parts} broken polygons left out of contours"] if self.lost_parts else []
         return f"{self.annotations}: {', '.join(parts)}" if parts else ""
 
     def ground_truth(self) -> dict[str, Any]:
@@ -127,7 +138,7 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         raise DataError(f"{files.annotations}: {len(content['images']) - len(images)} image ids are used twice")
     objects: dict[int, list[CocoObject]] = {image_id: [] for image_id in images}
     dropped: Counter[str] = Counter()
-    clipped = 0
+    clipped = lost = 0
     for row in content["annotations"]:
         image, label = _references(files.annotations, row, images, labels)
         if label == 0:
@@ -137,12 +148,13 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         if reason:
             dropped[reason] += 1
             continue
+        lost += lost_parts(row, segmentation)
         clipped += reaches_out(row.get("bbox"), image)
         objects[image.id].append(build_object(row, label, segmentation, image))
     kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
     if not any(o for image in kept for o in image.objects if not o.crowd):
         raise DataError(f"{files.annotations}: no object to learn: {dict(dropped) or 'no annotation of these classes'}")
-    return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped)
+    return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
 
 
 def _class_map(

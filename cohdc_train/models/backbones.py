@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from torchvision.models import get_model_weights
 from torchvision.models.resnet import BasicBlock, Bottleneck
@@ -19,6 +20,16 @@ _BLOCKS: dict[int, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, in
     34: (BasicBlock, (3, 4, 6, 3)),
     50: (Bottleneck, (3, 4, 6, 3)),
 }
+
+
+class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not typed
+    """Torchvision's, which in mixed precision turns every half-precision map into float32 and leaves it so."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.dtype == self.weight.dtype:
+            out: Tensor = super().forward(x)
+            return out
+        return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
 
 
 class HDCResNet(nn.Module):
@@ -50,7 +61,7 @@ class HDCResNet(nn.Module):
         if len(rates) != 4:
             raise ValueError(f"HDC rates {tuple(rates)}: {len(rates)} patterns for 4 stages")
         block, blocks = _BLOCKS[depth]
-        norm_layer: Callable[..., nn.Module] = nn.BatchNorm2d if norm == "batch" else FrozenBatchNorm2d
+        norm_layer: Callable[..., nn.Module] = nn.BatchNorm2d if norm == "batch" else FrozenNorm
         planes = [max(8, round(64 * width * 2**i / 8) * 8) for i in range(4)]
         self.conv1 = nn.Conv2d(3, planes[0], 7, stride=2, padding=3, bias=False)
         self.bn1 = norm_layer(planes[0])

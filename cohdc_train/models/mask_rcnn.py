@@ -10,12 +10,10 @@ from typing import Any, Literal
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
-from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
 from torchvision.models.detection.image_list import ImageList
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads
 from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss
-from torchvision.models.detection.rpn import RegionProposalNetwork, RPNHead
 from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
@@ -23,13 +21,13 @@ from cohdc_train.models.backbones import Depth, HDCResNet, load_backbone_weights
 from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss
 from cohdc_train.models.cqe_targets import Goal, band_of, cqe_targets
 from cohdc_train.models.mask_head import MaskSize, mask_loss, mask_predictor
+from cohdc_train.models.rpn import build_rpn, in_crowd
 from cohdc_train.models.true_masks import TrueMasks
 
 Target = dict[str, Any]
 ROI_LEVELS = ("0", "1", "2", "3")
 ROI_STRIDES = [4, 8, 16, 32]
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..1
-_CROWD_OVERLAP = 0.5  # share of a background anchor or proposal inside a crowd box from which it is not a negative
 
 
 @dataclass(frozen=True)
@@ -87,30 +85,6 @@ class NetworkConfig:
             raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
 
 
-class PreciseRPNHead(RPNHead):  # type: ignore[misc]  # torchvision is not typed
-    """Torchvision's RPN head, whose outputs are float32 also in mixed precision.
-
-    Torchvision gives its proposals the type of the deltas: in bfloat16 they, and the true boxes that join them, would
-    lie on a grid of 2 px at the 300th pixel.
-    """
-
-    def forward(self, x: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        logits, deltas = super().forward(x)
-        return [one.float() for one in logits], [one.float() for one in deltas]
-
-
-class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
-    """Torchvision's RPN, for which a background anchor inside a crowd box is no negative."""
-
-    def assign_targets_to_anchors(
-        self, anchors: list[Tensor], targets: list[Target]
-    ) -> tuple[list[Tensor], list[Tensor]]:
-        labels, matched = super().assign_targets_to_anchors(anchors, targets)
-        for label, anchor, target in zip(labels, anchors, targets, strict=True):
-            label[(label == 0) & _in_crowd(anchor, target)] = -1
-        return labels, matched
-
-
 class Backbone(nn.Module):
     """HDC ResNet and feature pyramid, under the names that torchvision's BackboneWithFPN uses."""
 
@@ -150,7 +124,7 @@ class MaskRCNN(nn.Module):
         self.num_classes = num_classes
         channels = config.fpn_channels
         self.backbone = Backbone(config)
-        self.rpn = _build_rpn(config)
+        self.rpn = build_rpn(channels, config.anchor_scales, config.proposals)
         self.roi_heads = _build_roi_heads(config, num_classes)
         self.cqe = None
         if config.cqe != "off":
@@ -197,7 +171,7 @@ class MaskRCNN(nn.Module):
         proposals = heads.add_gt_proposals([p.detach() for p in proposals], gt_boxes)
         matched, labels = heads.assign_targets_to_proposals(proposals, gt_boxes, [t["labels"] for t in targets])
         for label, proposal, target in zip(labels, proposals, targets, strict=True):
-            label[(label == 0) & _in_crowd(proposal, target)] = -1
+            label[(label == 0) & in_crowd(proposal, target)] = -1
         chosen = heads.subsample(labels)
         proposals = [p[c] for p, c in zip(proposals, chosen, strict=True)]
         labels = [label[c] for label, c in zip(labels, chosen, strict=True)]
@@ -243,28 +217,6 @@ class MaskRCNN(nn.Module):
         ]
         losses["cqe"] = cqe_loss(quality, classes - 1, torch.cat(goals))
         return losses
-
-
-def _in_crowd(boxes: Tensor, target: Target) -> Tensor:
-    """[n] bool: more than half of the box's area lies inside one of the target's `ignore` boxes."""
-    crowd = target.get("ignore")
-    if crowd is None or not len(crowd):
-        return torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
-    corner = torch.minimum(boxes[:, None, 2:], crowd[None, :, 2:]) - torch.maximum(
-        boxes[:, None, :2], crowd[None, :, :2]
-    )
-    area = (boxes[:, 2:] - boxes[:, :2]).prod(dim=1).clamp(min=1e-6)
-    share: Tensor = corner.clamp(min=0).prod(dim=2) / area[:, None]
-    return (share > _CROWD_OVERLAP).any(dim=1)
-
-
-def _build_rpn(config: NetworkConfig) -> CrowdAwareRPN:
-    anchors = AnchorGenerator(
-        tuple((scale,) for scale in config.anchor_scales), ((0.5, 1.0, 2.0),) * len(config.anchor_scales)
-    )
-    head = PreciseRPNHead(config.fpn_channels, anchors.num_anchors_per_location()[0])
-    top = {"training": config.proposals[0], "testing": config.proposals[1]}
-    return CrowdAwareRPN(anchors, head, 0.7, 0.3, 256, 0.5, {k: 2 * n for k, n in top.items()}, top, 0.7)
 
 
 def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:

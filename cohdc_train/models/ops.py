@@ -78,9 +78,9 @@ def roi_pool_levels(features: list[Tensor], boxes: Tensor, strides: list[int], s
     level = level.clamp(first, first + len(features) - 1) - first
     for i, feature in enumerate(features):
         chosen = torch.nonzero(level == i)[:, 0]
-        pooled[chosen] = roi_align(
-            feature, rois[chosen].to(feature.dtype), (side, side), 1.0 / strides[i], SAMPLING_RATIO
-        )
+        # in float32: a bfloat16 coordinate above 256 px is off by up to 1 px
+        cells = roi_align(feature.float(), rois[chosen].float(), (side, side), 1.0 / strides[i], SAMPLING_RATIO)
+        pooled[chosen] = cells.to(feature.dtype)
     return pooled
 
 

@@ -182,6 +182,11 @@ BROKEN: dict[str, Broken] = {
     "polygon of two points": Broken(_set(0, segmentation=[[3, 4, 19, 28]]), "contour-short"),
     "polygon of an odd count": Broken(_set(0, segmentation=[[3, 4, 19, 4, 19, 28, 3]]), "contour-odd"),
     "polygon with NaN": Broken(_set(0, segmentation=[[3, 4, 19, 4, float("nan"), 28]]), "contour-number"),
+    "polygon with infinity": Broken(_set(0, segmentation=[[3, 4, 19, 4, float("inf"), 28]]), "contour-number"),
+    "polygon to the moon": Broken(_set(0, segmentation=[[3, 4, 1e9, 4, 19, 28]], bbox=None), "contour-outside"),
+    "polygon of which a part is broken": Broken(
+        _set(0, segmentation=[[3, 4, 19, 4, 19, 28, 3, 28], [5, 5, 9, 9]]), "contour-short"
+    ),
     "polygon on a line": Broken(_set(0, segmentation=[[3, 4, 9, 4, 19, 4]], bbox=[3, 4, 16, 1]), "contour-empty"),
     "polygon outside": Broken(
         _set(0, segmentation=[[80, 4, 99, 4, 99, 28, 80, 28]], bbox=[80, 4, 19, 24]), "contour-empty"
@@ -195,12 +200,14 @@ BROKEN: dict[str, Broken] = {
     "RLE too short": Broken(_set(0, segmentation=_rle([5, 5])), "rle-counts"),
     "RLE text damaged": Broken(_set(0, segmentation=_rle(_GOOD[:-3])), "rle-counts"),
     "box without width": Broken(_set(0, bbox=[3, 4, 0, 24]), "box-degenerate"),
+    "box of text": Broken(_set(0, bbox=["3", "4", "16", "24"]), "box-degenerate"),
     "box inverted": Broken(_set(0, bbox=[19, 28, -16, -24]), "box-inverted"),
     "boxes of corners": Broken(_corners, "box-corners"),
     "box reaches out": Broken(_set(1, bbox=[30, 21, 40, 14]), "box-outside"),
     "box elsewhere": Broken(_box_twice_as_far, "box-disagrees"),
     "box missing": Broken(lambda c, r: c["annotations"][0].pop("bbox"), "box-missing"),
     "area of another unit": Broken(_set(0, area=3.84), "area-wrong"),
+    "area of text": Broken(_set(0, area="large"), "area-wrong"),
     "object of one pixel": Broken(
         _set(0, segmentation=[[30, 5, 31, 5, 31, 6, 30, 6]], bbox=[30, 5, 1, 1], area=1), "object-tiny"
     ),

@@ -1,6 +1,7 @@
 """The doctor on folders that are broken on purpose: it names each, training agrees with it, and the mend holds."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,11 @@ from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.data.findings import KINDS
 from cohdc_train.data.layout import CocoPaths
 from cohdc_train.errors import DataError
+from cohdc_train.models import MaskRCNN, NetworkConfig
+
+TINY = NetworkConfig(
+    depth=18, width=0.125, fpn_channels=8, fc=16, canvas=(32, 48), anchor_scales=(8, 16, 32, 64), rois=16
+)
 
 # Errors about what is learned and scored, not about what can be read.
 READABLE_ERRORS = {"leak", "box-corners"}
@@ -33,13 +39,30 @@ def findings(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[s
     return code, json.loads((root / "seen" / "findings.json").read_text())
 
 
+# What training does with a warning of this kind is counted in the line that it logs.
+COUNTED = {
+    **dict.fromkeys(
+        ("contour-missing", "contour-number", "contour-short", "contour-odd", "contour-empty"), "dropped|left"
+    ),
+    **dict.fromkeys(("box-degenerate", "box-inverted"), "degenerate box"),
+    "box-outside": "clipped",
+}
+
+
 def train_once(paths: dict[str, Any]) -> int:
-    """Every batch of a training; returns the number of objects in them."""
+    """A step on every batch of a training; returns the number of objects in them."""
     data = CocoDataModule(canvas=(32, 48), batch_size=2, workers=0, **paths)
     data.setup("fit")
     torch.manual_seed(0)
     batches = [data.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
     assert all(torch.isfinite(batch.images).all() for batch in batches)
+    network = MaskRCNN(data.num_classes, TINY)
+    for batch in batches:
+        total = sum(network.losses(batch.images, batch.targets).values())
+        assert torch.isfinite(total)
+        total.backward()
+    gradients = [p.grad for p in network.parameters() if p.requires_grad]
+    assert all(gradient is not None and torch.isfinite(gradient).all() for gradient in gradients)
     assert len(list(data.val_dataloader())) == 1
     return sum(len(target["labels"]) for batch in batches for target in batch.targets)
 
@@ -80,7 +103,10 @@ def test_it_is_found_training_agrees_and_the_mend_holds(
         with pytest.raises(DataError) as caught:
             train_once({"root": root})
         assert len(str(caught.value).splitlines()) == 1
+        assert str(root) in str(caught.value)
     else:
+        if case.kind in COUNTED:
+            assert re.search(COUNTED[case.kind], CocoDataModule(root).folder.train[0].losses())
         assert train_once({"root": root}) > 5
     if case.mended:
         check_mended(tmp_path / "mended", root)

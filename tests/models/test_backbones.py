@@ -4,8 +4,9 @@ import pytest
 import torch
 from torchvision.models import resnet18, resnet50
 from torchvision.models.feature_extraction import create_feature_extractor
+from torchvision.ops import FrozenBatchNorm2d
 
-from cohdc_train.models.backbones import HDCResNet, load_backbone_weights
+from cohdc_train.models.backbones import FrozenNorm, HDCResNet, load_backbone_weights
 
 PLAIN = ((1,),) * 4
 
@@ -86,3 +87,19 @@ def test_the_receptive_field_is_what_a_gradient_reaches():
     body(image)["3"][0, :, 16, 1].sum().backward()
     rows = image.grad.abs().sum(dim=(0, 1, 3)).nonzero()[:, 0]
     assert side - 4 <= int(rows.max() - rows.min()) + 1 <= side
+
+
+def test_frozen_norms_keep_half_precision_and_compute_torchvisions_values():
+    norm, reference = FrozenNorm(5), FrozenBatchNorm2d(5)
+    for name, buffer in norm.named_buffers():
+        buffer.uniform_(0.5, 2.0)
+        reference.get_buffer(name).copy_(buffer)
+    image = torch.rand(2, 5, 6, 7)
+    assert torch.equal(norm(image), reference(image))
+    half = image.bfloat16().requires_grad_()
+    out = norm(half)
+    assert out.dtype == torch.bfloat16
+    torch.testing.assert_close(out.float(), reference(half.float()), rtol=2**-8, atol=1e-3)
+    out.float().sum().backward()
+    scale = (norm.weight * (norm.running_var + norm.eps).rsqrt())[None, :, None, None]
+    torch.testing.assert_close(half.grad.float(), scale.expand_as(half), rtol=2**-7, atol=0)

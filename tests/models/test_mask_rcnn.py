@@ -141,8 +141,12 @@ def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
         features = network.features(torch.rand(1, 3, 96, 1024))
         proposals, _ = network.rpn(ImageList(torch.rand(1, 3, 96, 1024), [(96, 1024)]), features, targets)
         sampled, _, _, _ = network._sample(proposals, targets)
+        anchors = network.rpn.anchor_generator(
+            ImageList(torch.rand(1, 3, 96, 1024), [(96, 1024)]), list(features.values())
+        )
     assert all(torch.isfinite(loss) for loss in losses.values())
-    assert sampled[0].dtype == torch.float32
+    assert features["0"].dtype == torch.bfloat16
+    assert sampled[0].dtype == anchors[0].dtype == torch.float32
     assert (sampled[0] == targets[0]["boxes"][0]).all(dim=1).any()
 
 
