@@ -89,6 +89,7 @@ def two(root: Path) -> list[dict[str, Any]]:
     return fit(root, root / "two", processes=2, batch_size=2)
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_loss_curve_of_one_with_twice_the_batch(one: Any, two: Any) -> None:
     losses = curve(one)
     assert len(losses) == STEPS
@@ -97,12 +98,14 @@ def test_two_processes_have_the_loss_curve_of_one_with_twice_the_batch(one: Any,
     torch.testing.assert_close(curve(two), losses, rtol=TOLERANCE, atol=0)
 
 
+@pytest.mark.slow
 def test_two_processes_end_with_the_weights_of_one(one: Any, two: Any) -> None:
     for name, weight in one[0]["weights"].items():
         assert torch.equal(two[0]["weights"][name], two[1]["weights"][name]), name
         torch.testing.assert_close(two[0]["weights"][name], weight, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_validation_counts_every_image_once(one: Any, two: Any) -> None:
     """Three images over two processes: one of them is given out twice."""
     scores = one[0]["scores"]
