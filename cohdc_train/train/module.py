@@ -80,10 +80,6 @@ class MaskRCNNModule(pl.LightningModule):
             raise CohdcError(f"{path}: not a checkpoint of cohdc fit: {type(error).__name__}: {reason}") from error
         return module.eval()
 
-    def setup(self, stage: str) -> None:
-        """Weights with the channels last, as half-precision convolutions read them fastest; the values are the same."""
-        self.network.to(memory_format=torch.channels_last)
-
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """The sum of the losses. Raises CohdcError naming step and images when it is not finite."""
         losses = self.network.losses(batch.images, batch.targets)
