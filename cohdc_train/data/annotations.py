@@ -137,7 +137,7 @@ def _decompressed(text: str) -> list[int]:
 def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
     """Why an annotation cannot be used; empty when it can."""
     box = row.get("bbox")
-    if box is not None and not (_is_numbers(box, 4) and _has_extent(_clip(box, image))):
+    if box is not None and not (is_numbers(box, 4) and _has_extent(_clip(box, image))):
         return "degenerate box"
     if not segmentation:
         return "" if row.get("iscrowd") and box is not None else "no contour"
@@ -148,7 +148,7 @@ def build_object(row: dict[str, Any], label: int, segmentation: Any, image: Coco
     """The object of a sound annotation; a missing box is taken from the contour."""
     box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
     area, number = row.get("area"), row.get("id")
-    area = float(area) if area and _is_numbers([area], 1) else box[2] * box[3]
+    area = float(area) if area and is_numbers([area], 1) else box[2] * box[3]
     return CocoObject(
         number if isinstance(number, int) else 0, label, box, area, segmentation, bool(row.get("iscrowd", 0))
     )
@@ -170,7 +170,8 @@ def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, 
     return x0, y0, x1 - x0, y1 - y0
 
 
-def _is_numbers(values: Any, count: int) -> bool:
+def is_numbers(values: Any, count: int) -> bool:
+    """Whether the values are a list of `count` finite numbers."""
     listed = isinstance(values, list | tuple) and len(values) == count
     return listed and all(isinstance(value, int | float) and math.isfinite(value) for value in values)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from cohdc_train.data import image_files
-from cohdc_train.data.annotations import read_image
+from cohdc_train.data.annotations import CocoImage, read_image
 from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder, read_split
 from cohdc_train.data.layout import CocoPaths, find_split
 from cohdc_train.data.train_set import CocoTrainSet, Target
@@ -165,9 +165,7 @@ class CocoDataModule(pl.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled batches of `TrainBatch`; the order and every draw follow torch's seed."""
-        images, givers = (
-            [image for split in splits for image in split.images] for splits in (self.folder.train, self.givers)
-        )
+        images, givers = _images(self.folder.train), _images(self.givers)
         training = CocoTrainSet(images, self.canvas, self.augment, self.mini_mask, givers)
         return self._loader(training, shuffle=True, collate=_collate_train)
 
@@ -199,6 +197,10 @@ class CocoDataModule(pl.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.workers > 0,
         )
+
+
+def _images(splits: Sequence[CocoSplit]) -> list[CocoImage]:
+    return [image for split in splits for image in split.images]
 
 
 def _collate_train(samples: Sequence[tuple[Tensor, Target]]) -> TrainBatch:

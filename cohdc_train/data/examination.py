@@ -1,13 +1,12 @@
 """One annotation of a COCO-format file under the magnifying glass: what is wrong with it, and its mended row."""
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from pycocotools import mask as rle
 from shapely import Polygon, box, clip_by_rect, get_parts
 
-from cohdc_train.data.annotations import fills
+from cohdc_train.data.annotations import fills, is_numbers
 
 _TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
 _DISAGREE, _AGREE = 0.5, 0.9  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
@@ -31,7 +30,7 @@ def examine(row: dict[str, Any], height: int, width: int) -> Examined:
         findings.append("crowd")
     segmentation = row.get("segmentation")
     if not segmentation:
-        if crowd and _numbers(row.get("bbox"), 4):
+        if crowd and is_numbers(row.get("bbox"), 4):
             return Examined(findings, row, None)
         return Examined([*findings, "contour-missing"], None, None)
     kinds, mended = _mend_segmentation(segmentation, height, width)
@@ -101,7 +100,7 @@ def _fault(part: Any) -> str:
     """Why a polygon cannot be drawn; empty when it can."""
     if not isinstance(part, list):
         return "contour-format"
-    if not _numbers(part, len(part)):
+    if not is_numbers(part, len(part)):
         return "contour-number"
     if len(part) % 2:
         return "contour-odd"
@@ -126,7 +125,7 @@ def _clipped(part: list[float], outline: Polygon, height: int, width: int) -> li
 
 def _mend_rle(given: dict[str, Any], height: int, width: int) -> tuple[list[str], dict[str, Any] | None]:
     size, counts = given.get("size"), given.get("counts")
-    if not _numbers(size, 2) or not isinstance(counts, str | bytes | list):
+    if not is_numbers(size, 2) or not isinstance(counts, str | bytes | list):
         return ["contour-format"], None
     if list(size) != [height, width]:  # type: ignore[arg-type]
         return ["rle-size"], None
@@ -139,7 +138,7 @@ def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str
     """Kinds of findings and the box to keep: the annotated one, clipped, unless the contour's is the better."""
     if given is None:
         return ["box-missing"], tight
-    if not _numbers(given, 4):
+    if not is_numbers(given, 4):
         return ["box-degenerate"], tight
     x, y, w, h = (float(v) for v in given)
     if w < 0 or h < 0:
@@ -165,14 +164,6 @@ def _near(a: Box, b: Box) -> bool:
     """Whether no edge is off by more than the tolerance: of an object of a few px, one px is half the IoU."""
     edges = [(v[0], v[1], v[0] + v[2], v[1] + v[3]) for v in (a, b)]
     return all(abs(one - other) <= _TOLERANCE for one, other in zip(*edges, strict=True))
-
-
-def _numbers(values: Any, count: int) -> bool:
-    return (
-        isinstance(values, list | tuple)
-        and len(values) == count
-        and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
-    )
 
 
 def _text(encoded: dict[str, Any]) -> dict[str, Any]:

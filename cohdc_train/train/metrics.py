@@ -139,7 +139,7 @@ def precision_table(ground_truth: Mapping[str, Any], results: Sequence[Row], kin
 
 
 def _averages(ground_truth: Mapping[str, Any], precision: NDArray[np.float64]) -> dict[str, float]:
-    names = [row["name"] for row in sorted(ground_truth["categories"], key=lambda row: row["id"])]
+    names = category_names(ground_truth)
     per_class = {f"AP/{name}": mean_valid(precision[:, :, i]) for i, name in enumerate(names) if len(names) > 1}
     return {
         **{name: value for name, value in per_class.items() if not np.isnan(value)},
@@ -269,6 +269,11 @@ def _gather(seen: dict[int, list[Row]]) -> dict[int, list[Row]]:
     parts: list[Any] = [None] * torch.distributed.get_world_size()
     torch.distributed.all_gather_object(parts, seen)
     return {image_id: rows for part in parts for image_id, rows in part.items()}
+
+
+def category_names(ground_truth: Mapping[str, Any]) -> list[str]:
+    """Names of a COCO dict's categories, by id."""
+    return [str(row["name"]) for row in sorted(ground_truth["categories"], key=lambda row: row["id"])]
 
 
 def mean_valid(precision: NDArray[np.float64]) -> float:

@@ -13,7 +13,7 @@ from cohdc_train.data.annotations import CocoImage
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes
 from cohdc_train.train.matching import confusion_matrix, match_images, ranked
-from cohdc_train.train.metrics import Results
+from cohdc_train.train.metrics import Results, category_names
 from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.plots import class_names, plot_calibration, plot_confusion, plot_log, plot_precision_recall
 from cohdc_train.train.tiles import draw_tiles
@@ -30,7 +30,7 @@ def draw_validation(results: Results, images: Iterable[CocoImage]) -> dict[str, 
     """
     matches = match_images(results)
     by_id = {image.id: image for image in images}
-    names = [str(row["name"]) for row in sorted(results.truth["categories"], key=lambda row: row["id"])]
+    names = category_names(results.truth)
     best, worst = ranked(matches, _IMAGES)
     files = {
         f"{which}.jpg": draw_tiles(f"{which} of {len(matches)} validation images; {_SCORE}", chosen, by_id, names)

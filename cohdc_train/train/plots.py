@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.train.metrics import CERTAIN, IOUS, MATCH_IOU, RECALLS, Results, mean_valid, quality_pairs
+from cohdc_train.train.metrics import (
+    CERTAIN,
+    IOUS,
+    MATCH_IOU,
+    RECALLS,
+    Results,
+    category_names,
+    mean_valid,
+    quality_pairs,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,7 +34,7 @@ _STYLES = {"AP": ("AP", "-"), "AP50": ("AP50", "--"), "AP70": ("AP70", ":")}
 
 def class_names(truth: Mapping[str, Any]) -> list[str]:
     """Names of a COCO dict's categories by id, cut to what a plot has room for; a dollar starts no formula."""
-    return [_short(str(row["name"])) for row in sorted(truth["categories"], key=lambda row: row["id"])]
+    return [_short(name) for name in category_names(truth)]
 
 
 def _short(name: str) -> str:
