@@ -77,7 +77,8 @@ def _on_canvas(masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, 
         high = torch.maximum(box[2:], shapes.high[g]).ceil()
         width, height = (int(v) for v in (high - low).clamp(min=1))
         region = torch.cat([low, low + low.new_tensor([width, height])])[None]
-        true = truth.within(region, g[None], (height, width), samples=1)[0] >= 0.5
+        inside = _within_box(truth.frames[g] - low.repeat(2), height, width)  # RoIAlign repeats the raster's edge
+        true = (truth.within(region, g[None], (height, width), samples=1)[0] >= 0.5) & inside
         predicted = _pasted(mask, box - low.repeat(2), height, width)
         score = boundary_iou(predicted, true, band)
         scores[k] = torch.minimum(score, _iou(predicted, true)) if lesser else score
@@ -92,7 +93,13 @@ def _pasted(mask: Tensor, box: Tensor, height: int, width: int) -> Tensor:
     y, x = torch.meshgrid(axes[1], axes[0], indexing="ij")
     grid = torch.stack([x, y], dim=-1)[None].to(mask.dtype)
     sampled = F.grid_sample(mask[None, None], grid, "bilinear", "border", align_corners=False)[0, 0]
-    return (sampled > 0.5) & (x.abs() <= 1) & (y.abs() <= 1)
+    return (sampled > 0.5) & _within_box(box, height, width)
+
+
+def _within_box(box: Tensor, height: int, width: int) -> Tensor:
+    """bool [height, width]: pixels whose centre lies inside a box (xyxy, px)."""
+    x, y = (torch.arange(count, device=box.device) + 0.5 for count in (width, height))
+    return ((y >= box[1]) & (y < box[3]))[:, None] & (x >= box[0]) & (x < box[2])
 
 
 class Shape(NamedTuple):

@@ -85,8 +85,10 @@ def test_yolo_polygons_come_back(height: int, width: int, centre: tuple[float, f
     (found,) = image.objects
     exact = star * (width, height)
     np.testing.assert_allclose(np.reshape(found.segmentation, (-1, 2)), exact, atol=1e-3)
-    expected = drawn(exact.ravel().tolist(), size=(height, width))
-    assert iou(found.mask(height, width), expected) > 0.97
+    mask = found.mask(height, width)
+    assert (mask == drawn(found.segmentation[0], size=(height, width))).all()
+    if mask.sum() > 400:  # of fewer pixels, the three or so whose rounding falls the other way weigh more
+        assert iou(mask, drawn(exact.ravel().tolist(), size=(height, width))) > 0.97
 
 
 YOLO_ERRORS = {
