@@ -70,13 +70,9 @@ def nms_keep(boxes: Any, scores: Any, iou_threshold: float, score_threshold: flo
     return op.Cast(op.ScatterND(nothing, pairs, ones), to=_BOOL)
 
 
-def roi_pool_levels(features: list[Any], boxes: Any, strides: list[int], side: int) -> Any:
+def roi_pool_levels(features: list[Any], boxes: Any, images: Any, strides: list[int], side: int) -> Any:
     """`models.ops.roi_pool_levels`: one RoiAlign per level over that level's boxes, put back in the boxes' order."""
-    shape = op.Shape(boxes)
-    flat = op.Reshape(boxes, _ints(-1, 4))
-    images = op.Unsqueeze(_range(op.Squeeze(op.Gather(shape, _ints(0)))), _ints(1))
-    batch = op.Reshape(op.Expand(images, op.Gather(shape, _ints(0, 1))), _ints(-1))
-    sides = op.Sub(op.Slice(flat, _ints(2), _ints(4), _ints(1)), op.Slice(flat, _ints(0), _ints(2), _ints(1)))
+    sides = op.Sub(op.Slice(boxes, _ints(2), _ints(4), _ints(1)), op.Slice(boxes, _ints(0), _ints(2), _ints(1)))
     area = op.ReduceProd(sides, _ints(1), keepdims=0)
     octave = op.Log(op.Add(op.Div(op.Sqrt(area), _float(float(CANONICAL_SIDE))), _float(1e-8)))
     level = op.Add(_float(float(CANONICAL_LEVEL)), op.Div(octave, _float(math.log(2.0))))
@@ -90,8 +86,8 @@ def roi_pool_levels(features: list[Any], boxes: Any, strides: list[int], side: i
         pooled.append(
             op.RoiAlign(
                 feature,
-                op.Gather(flat, rows),
-                op.Gather(batch, rows),
+                op.Gather(boxes, rows),
+                op.Gather(images, rows),
                 coordinate_transformation_mode="output_half_pixel",
                 mode="avg",
                 output_height=side,
@@ -105,8 +101,15 @@ def roi_pool_levels(features: list[Any], boxes: Any, strides: list[int], side: i
     return op.Gather(op.Concat(*pooled, axis=0), inverse, axis=0)
 
 
+def rows_to_segment(present: Any) -> Any:
+    """`models.ops.rows_to_segment`."""
+    first = op.Equal(_range(op.Squeeze(op.Shape(present))), op.Constant(value_int=0))
+    return op.Reshape(op.NonZero(op.Or(present, first)), _ints(-1))
+
+
 TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.cohdc.letterbox.default: letterbox,
     torch.ops.cohdc.nms_keep.default: nms_keep,
     torch.ops.cohdc.roi_pool_levels.default: roi_pool_levels,
+    torch.ops.cohdc.rows_to_segment.default: rows_to_segment,
 }

@@ -140,7 +140,7 @@ def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
     if box is not None and not (is_numbers(box, 4) and _has_extent(_clip(box, image))):
         return "degenerate box"
     if not segmentation:
-        return "" if row.get("iscrowd") and box is not None else "no contour"
+        return "" if is_crowd(row) and box is not None else "no contour"
     return "" if _has_extent(_clip(_extent(segmentation), image)) else "degenerate contour"
 
 
@@ -149,9 +149,12 @@ def build_object(row: dict[str, Any], label: int, segmentation: Any, image: Coco
     box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
     area, number = row.get("area"), row.get("id")
     area = float(area) if area and is_numbers([area], 1) else box[2] * box[3]
-    return CocoObject(
-        number if isinstance(number, int) else 0, label, box, area, segmentation, bool(row.get("iscrowd", 0))
-    )
+    return CocoObject(number if isinstance(number, int) else 0, label, box, area, segmentation, is_crowd(row))
+
+
+def is_crowd(row: dict[str, Any]) -> bool:
+    """Whether `iscrowd` is 1, as a number, a truth value or text; all else is none."""
+    return row.get("iscrowd") in (1, "1", "true")
 
 
 def _extent(segmentation: Any) -> tuple[float, float, float, float]:

@@ -192,7 +192,7 @@ def _references(path: Path, row: Any, images: dict[int, CocoImage], labels: dict
     if not isinstance(row, dict):
         raise DataError(f"{path}: annotation {row!r:.40}: needs id, image_id, category_id and segmentation")
     for key, known in (("image_id", images), ("category_id", labels)):
-        if row.get(key) not in known:
+        if not isinstance(row.get(key), int | float) or row[key] not in known:
             raise DataError(f"{path}: annotation {row.get('id')}: {key} {row.get(key)} is not in the file")
     return images[row["image_id"]], labels[row["category_id"]]
 

@@ -6,7 +6,7 @@ import numpy as np
 from pycocotools import mask as rle
 from shapely import Polygon, box, clip_by_rect, get_parts
 
-from cohdc_train.data.annotations import fills, is_numbers
+from cohdc_train.data.annotations import fills, is_crowd, is_numbers
 
 _TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
 _DISAGREE, _AGREE = 0.5, 0.9  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
@@ -25,7 +25,7 @@ class Examined(NamedTuple):
 def examine(row: dict[str, Any], height: int, width: int) -> Examined:
     """Look at segmentation, box and area of one annotation of an image of height x width px."""
     findings: list[str] = []
-    crowd = bool(row.get("iscrowd"))
+    crowd = is_crowd(row)
     if crowd:
         findings.append("crowd")
     segmentation = row.get("segmentation")

@@ -50,7 +50,7 @@ KINDS: dict[str, Kind] = {
     "image-huge": Kind("note", "image above 24 megapixels", "none needed; a smaller copy is read faster"),
     "image-empty": Kind("note", "image without objects", "none needed: it teaches what is background"),
     "image-crowded": Kind("note", "more than 100 objects in an image", "raise model.network.detections"),
-    "annotation-broken": Kind("error", "annotation is no mapping", _EXPORT),
+    "annotation-broken": Kind("error", "annotation is no mapping, or an id of it is a list", _EXPORT),
     "annotation-orphan": Kind("error", "annotation of an image that is not listed", _EXPORT),
     "annotation-category": Kind("error", "annotation of a category that is not listed", _EXPORT),
     "annotation-id": Kind("warning", "annotation id used twice or missing", "--fix gives a new one"),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as rle
 
+from cohdc_train.data.annotations import is_crowd
 from cohdc_train.data.examination import examine, fits
 from cohdc_train.data.findings import Findings
 from cohdc_train.data.image_files import ImageFile, fingerprint, look
@@ -56,7 +57,7 @@ def inspect(name: str, files: SplitPaths) -> Inspection:
     given = read_json(files.annotations)
     split = Inspection(name, files)
     categories, join = _categories(split, given["categories"])
-    rows = [row for row in given["annotations"] if _is_mapping(split, row)]
+    rows = [row for row in given["annotations"] if _is_row(split, row)]
     images, joined = _images(split, given["images"], rows)
     for row in rows:
         row["image_id"] = joined.get(row.get("image_id"), row.get("image_id"))
@@ -72,8 +73,9 @@ def inspect(name: str, files: SplitPaths) -> Inspection:
     return split
 
 
-def _is_mapping(split: Inspection, row: Any) -> bool:
-    if isinstance(row, dict):
+def _is_row(split: Inspection, row: Any) -> bool:
+    ids = ("id", "image_id", "category_id")
+    if isinstance(row, dict) and not any(isinstance(row.get(key), list | dict) for key in ids):
         return True
     split.fault("annotation-broken", f"{row!r:.40}", row)
     return False
@@ -204,7 +206,7 @@ def _without_twins(split: Inspection, image: Row, pairs: Sequence[tuple[Row, dic
     twins: set[int] = set()
     classes: dict[Any, list[int]] = defaultdict(list)
     for i, (row, shape) in enumerate(pairs):
-        if shape is not None and not row.get("iscrowd"):
+        if shape is not None and not is_crowd(row):
             classes[row["category_id"]].append(i)
     for members in classes.values():
         shapes = [pairs[i][1] for i in members]

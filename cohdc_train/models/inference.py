@@ -1,6 +1,6 @@
 """The padded forward: from uint8 images to a fixed number of detections, the same code in torch and in the export.
 
-No shape depends on what is in the image; rows that hold no detection are zeros behind `count`.
+Rows that hold no detection are zeros behind `count`; only the others go through the mask and CQE heads.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cohdc_train.models.mask_rcnn import ROI_LEVELS, ROI_STRIDES, MaskRCNN
-from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels
+from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels, rows_to_segment
 
 _RPN_NMS_IOU = 0.7
 _CANDIDATES = 1000  # best (proposal, class) pairs that enter the last suppression
@@ -73,11 +73,8 @@ def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> Padd
     proposals = _propose(network, list(pyramid.values()), limit)
     levels = [pyramid[name] for name in ROI_LEVELS]
     boxes, labels, scores, count = _classify(network, levels, proposals, limit)
-    masks, quality = _segment(network, levels, boxes, labels)
-    batch, n = labels.shape
-    present = torch.arange(n, device=count.device)[None] < count[:, None]
-    masks = masks.reshape(batch, n, *masks.shape[-2:]) * present[:, :, None, None]
-    return PaddedDetections(boxes, labels, scores, quality.reshape(batch, n) * present, masks, count)
+    masks, quality = _segment(network, levels, boxes, labels, count)
+    return PaddedDetections(boxes, labels, scores, quality, masks, count)
 
 
 def _propose(network: MaskRCNN, features: list[Tensor], limit: Tensor) -> Tensor:
@@ -106,7 +103,8 @@ def _classify(
     """Boxes [B, N, 4], 0-based labels [B, N], scores [B, N] falling, count [B]; padded with zeros."""
     config, heads = network.config, network.roi_heads
     batch, rois = proposals.shape[:2]
-    pooled = roi_pool_levels(levels, proposals, ROI_STRIDES, 7)
+    images = torch.arange(batch, device=proposals.device).repeat_interleave(rois)
+    pooled = roi_pool_levels(levels, proposals.reshape(batch * rois, 4), images, ROI_STRIDES, 7)
     logits, deltas = heads.box_predictor(heads.box_head(pooled))
     classes = network.num_classes
     scores = logits.float().softmax(dim=1)[:, 1:].reshape(batch, rois * classes)
@@ -125,18 +123,25 @@ def _classify(
     return boxes, label.gather(1, best) * present, scores, present.sum(dim=1)
 
 
-def _segment(network: MaskRCNN, levels: list[Tensor], boxes: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Masks [B * N, M, M] and quality [B * N] of the predicted classes."""
+def _segment(
+    network: MaskRCNN, levels: list[Tensor], boxes: Tensor, labels: Tensor, count: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Masks [B, N, M, M] and quality [B, N] of the predicted classes; zeros in rows at or behind count [B]."""
     heads = network.roi_heads
-    pooled = roi_pool_levels(levels, boxes, ROI_STRIDES, 14)
+    batch, n = labels.shape
+    present = torch.arange(n, device=count.device)[None] < count[:, None]
+    rows = rows_to_segment(present.reshape(batch * n))
+    label = labels.reshape(batch * n)[rows]
+    pooled = roi_pool_levels(levels, boxes.reshape(batch * n, 4)[rows], rows // n, ROI_STRIDES, 14)
     logits = heads.mask_predictor(heads.mask_head(pooled))
-    flat = labels.reshape(-1)
     side = logits.shape[-1]
-    masks = logits.gather(1, (flat + 1)[:, None, None, None].expand(-1, 1, side, side))[:, 0].sigmoid()
+    masks = logits.gather(1, (label + 1)[:, None, None, None].expand(-1, 1, side, side))[:, 0].sigmoid()
+    padded = masks.new_zeros((batch * n, side, side), dtype=torch.float32)
+    padded = padded.index_put((rows,), masks.float()).reshape(batch, n, side, side) * present[:, :, None, None]
     if network.cqe is None:
-        return masks.float(), torch.ones_like(masks[:, 0, 0], dtype=torch.float32)
-    quality = network.cqe(pooled, masks).gather(1, flat[:, None])[:, 0]
-    return masks.float(), quality.float().clamp(0.0, 1.0)
+        return padded, present.float()
+    quality = network.cqe(pooled, masks).gather(1, label[:, None])[:, 0].float().clamp(0.0, 1.0)
+    return padded, quality.new_zeros((batch * n,)).index_put((rows,), quality).reshape(batch, n) * present
 
 
 def _flatten(maps: Tensor, values: int) -> Tensor:

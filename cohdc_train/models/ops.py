@@ -1,6 +1,7 @@
-"""Four operators with fixed output shapes, so that the detector exports with every inner shape known.
+"""Operators that keep the detector exportable: every inner shape but one is known beforehand.
 
-Each is an ordinary torch function wrapped as a custom operator; `cohdc_train.export` says what it is in ONNX.
+The one is how many detections there are to segment. Each is an ordinary torch function wrapped as a custom operator;
+`cohdc_train.export` says what it is in ONNX.
 """
 
 import torch
@@ -61,19 +62,16 @@ def _(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: floa
 
 
 @torch.library.custom_op("cohdc::roi_pool_levels", mutates_args=())
-def roi_pool_levels(features: list[Tensor], boxes: Tensor, strides: list[int], side: int) -> Tensor:
+def roi_pool_levels(features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int) -> Tensor:
     """RoIAlign of every box from the pyramid level that suits its size (FPN, eq. 1 of Lin et al. 2017).
 
-    features: [B, C, H / s, W / s] for each stride s; boxes: float32 [B, R, 4] xyxy, canvas px.
-    Returns [B * R, C, side, side].
+    features: [B, C, H / s, W / s] for each stride s; boxes: float32 [R, 4] xyxy, canvas px; images: int64 [R], which
+    image each box is of. Returns [R, C, side, side].
     """
-    count = boxes.shape[0] * boxes.shape[1]
-    flat = boxes.reshape(count, 4)
-    batch = torch.arange(boxes.shape[0], device=boxes.device).repeat_interleave(boxes.shape[1])
-    rois = torch.cat([batch[:, None].to(flat.dtype), flat], dim=1)
-    area = (flat[:, 2] - flat[:, 0]) * (flat[:, 3] - flat[:, 1])
+    rois = torch.cat([images[:, None].to(boxes.dtype), boxes], dim=1)
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     level = torch.floor(CANONICAL_LEVEL + torch.log2(area.sqrt() / CANONICAL_SIDE + 1e-8) + 1e-6)
-    pooled = features[0].new_zeros((count, features[0].shape[1], side, side))
+    pooled = features[0].new_zeros((boxes.shape[0], features[0].shape[1], side, side))
     first = strides[0].bit_length() - 1
     level = level.clamp(first, first + len(features) - 1) - first
     for i, feature in enumerate(features):
@@ -85,5 +83,19 @@ def roi_pool_levels(features: list[Tensor], boxes: Tensor, strides: list[int], s
 
 
 @roi_pool_levels.register_fake
-def _(features: list[Tensor], boxes: Tensor, strides: list[int], side: int) -> Tensor:
-    return features[0].new_empty((boxes.shape[0] * boxes.shape[1], features[0].shape[1], side, side))
+def _(features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int) -> Tensor:
+    return features[0].new_empty((boxes.shape[0], features[0].shape[1], side, side))
+
+
+@torch.library.custom_op("cohdc::rows_to_segment", mutates_args=())
+def rows_to_segment(present: Tensor) -> Tensor:
+    """Which rows of bool [R] are True, as int64 [K] rising. The first is always one of them, so that K is never 0."""
+    wanted = present.clone()
+    wanted[0] = True
+    return torch.nonzero(wanted)[:, 0]
+
+
+@rows_to_segment.register_fake
+def _(present: Tensor) -> Tensor:
+    count = torch.library.get_ctx().new_dynamic_size(min=1)
+    return present.new_empty((count,), dtype=torch.int64)

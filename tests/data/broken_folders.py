@@ -170,6 +170,7 @@ BROKEN: dict[str, Broken] = {
     ),
     "500 objects in an image": Broken(_many, "image-crowded"),
     "annotation of text": Broken(_add("annotations", "person"), "annotation-broken"),
+    "annotation of many images": Broken(_set(0, image_id=[1, 2]), "annotation-broken"),
     "annotation of an unknown image": Broken(_set(0, image_id=99), "annotation-orphan"),
     "annotation of an unknown category": Broken(_set(0, category_id=99), "annotation-category"),
     "annotation id twice": Broken(_set(0, id=2), "annotation-id"),
@@ -212,6 +213,7 @@ BROKEN: dict[str, Broken] = {
         _set(0, segmentation=[[30, 5, 31, 5, 31, 6, 30, 6]], bbox=[30, 5, 1, 1], area=1), "object-tiny"
     ),
     "crowd": Broken(_set(0, iscrowd=1), "crowd"),
+    "crowd as text": Broken(_set(0, iscrowd="1"), "crowd"),
     "validation image in train": Broken(_leak, "leak", mended=False),
 }
 

@@ -99,15 +99,16 @@ def test_the_class_filter_remaps_and_counts_classes(tmp_path: Path) -> None:
         split_of(tmp_path, classes=["dog"])
 
 
-def test_crowd_and_images_without_objects_are_kept(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("given", "crowd"), [(1, True), ("1", True), (True, True), ("0", False), (None, False)])
+def test_crowd_and_images_without_objects_are_kept(given: Any, crowd: bool, tmp_path: Path) -> None:
     def change(value: dict[str, Any]) -> None:
         value["annotations"] = [row for row in value["annotations"] if row["image_id"] == 1]
-        value["annotations"][1].update(iscrowd=1)
+        value["annotations"][1].update(iscrowd=given)
 
     split = split_of(tmp_path, change)
     assert [len(image.objects) for image in split.images] == [2, 0, 0]
-    assert [o.crowd for o in split.images[0].objects] == [False, True]
-    assert [row["iscrowd"] for row in split.ground_truth()["annotations"]] == [0, 1]
+    assert [o.crowd for o in split.images[0].objects] == [False, crowd]
+    assert [row["iscrowd"] for row in split.ground_truth()["annotations"]] == [0, int(crowd)]
 
 
 def test_degenerate_objects_are_dropped_and_counted(tmp_path: Path) -> None:

@@ -85,6 +85,24 @@ def test_padding_is_zero_and_scores_fall(opinionated):
         assert all(not tensor[i, n:].any() for tensor in (boxes, labels, scores, quality, masks))
 
 
+def test_only_detections_go_through_the_mask_and_cqe_heads(opinionated):
+    passed = {"mask": 0, "cqe": 0}
+    heads = {"mask": opinionated.roi_heads.mask_head, "cqe": opinionated.cqe}
+    hooks = [
+        module.register_forward_pre_hook(lambda _, inputs, name=name: passed.update({name: len(inputs[0])}))
+        for name, module in heads.items()
+    ]
+    black, noise = torch.zeros(3, 80, 60, dtype=torch.uint8), torch.randint(0, 255, (3, 80, 60), dtype=torch.uint8)
+    with torch.inference_mode():
+        found = detect(opinionated, [black, noise, noise.flip(2)])
+    for hook in hooks:
+        hook.remove()
+    count = sum(len(one["scores"]) for one in found)
+    assert 0 < count < 3 * opinionated.config.detections
+    # the first row stands for itself even where it is empty, so that no head runs on nothing
+    assert passed == dict.fromkeys(passed, count + (not len(found[0]["scores"])))
+
+
 def test_boxes_stay_inside_an_image_of_any_shape(opinionated):
     with torch.inference_mode():
         for height, width in ((31, 200), (200, 31), (96, 128)):
