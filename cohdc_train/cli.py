@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import Any, NamedTuple
 
 from cohdc_train.errors import CohdcError, MissingExtraError
@@ -23,7 +23,7 @@ VERBS = {
     ),
     "synth": Verb("synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"),
     "fit": Verb("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),
-    "validate": Verb("train.cli", "validate", "score a checkpoint on a COCO-format folder"),
+    "validate": Verb("validate", "validate", "score a checkpoint or an ONNX on a COCO-format folder"),
     "export": Verb("export", "export", "checkpoint -> ONNX, run and compared before it is kept"),
     "predict": Verb("predict", "predict", "run an ONNX on images: overlays and COCO JSON (no torch)"),
     "slam": Verb("slam.run", "slam", "RGB-D sequence -> trajectory, map tracking with people removed (no torch)"),
@@ -33,8 +33,8 @@ VERBS = {
 
 # fmt: off
 _TRAIN_PACKAGES = frozenset({
-    "torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "kornia", "rich",
-    "tensorboard", "embreex", "shapely", "PIL",
+    "torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "onnxslim", "kornia",
+    "rich", "tensorboard", "embreex", "shapely", "PIL",
 })
 # fmt: on
 
@@ -71,7 +71,7 @@ def _call(name: str, args: list[str]) -> None:
     verb = VERBS[name]
     try:
         component = getattr(importlib.import_module(f"cohdc_train.{verb.module}"), verb.attribute)
-        if name in ("fit", "validate"):  # Lightning's own command line, which reads the arguments itself
+        if name == "fit":  # Lightning's own command line, which reads the arguments itself
             component(args)
             return
         _run_function(component, args, f"cohdc {name}")
@@ -83,17 +83,38 @@ def _call(name: str, args: list[str]) -> None:
         raise MissingExtraError(message) from error
 
 
+def _spelled_out(args: Sequence[str], switches: Container[str]) -> list[str]:
+    """Arguments with option names in underscores, and a switch's value behind it unless a truth value follows."""
+    spelled: list[str] = []
+    for i, arg in enumerate(args):
+        name, equals, value = arg.partition("=")
+        if not name.startswith("--"):
+            spelled.append(arg)
+            continue
+        name = "--" + name[2:].replace("-", "_")
+        if name in switches and not equals and args[i + 1 : i + 2] not in (["true"], ["false"]):
+            equals, value = "=", "true"
+        spelled.append(name + equals + value)
+    return spelled
+
+
 def _run_function(component: Any, args: list[str], prog: str) -> None:
     """Run a typed function, or the group of them in a dict, with a command line read from its signature."""
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
+
+    switches: set[str] = set()
 
     class Parser(ArgumentParser):
         """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`."""
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
             if kwargs.get("type") is bool and names[0].startswith("--"):
+                switches.add(names[0])
                 del kwargs["type"]
                 kwargs |= {"action": ActionYesNo, "nargs": "?"}
             return super().add_argument(*names, **kwargs)
+
+        def parse_args(self, args: Any = None, *rest: Any, **kwargs: Any) -> Any:
+            return super().parse_args(_spelled_out(args, switches), *rest, **kwargs)
 
     auto_cli(component, args=args, prog=prog, as_positional=True, parser_class=Parser)

@@ -148,7 +148,7 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
     By the command line, which Lightning starts once more for the second process of the two that configs/demo.yaml asks
     for.
     """
-    from cohdc_train.train.cli import score
+    from cohdc_train.validate import validate
 
     options = {
         "--config": "demo.yaml",
@@ -161,7 +161,7 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
     fit = [sys.executable, "-m", "cohdc_train", "fit", *(str(part) for option in options.items() for part in option)]
     if subprocess.run(fit, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode != 0:
         raise CohdcError("the training ended early; its own message stands above")
-    return score(out / "train" / "best.ckpt", out / "data", out / "train" / "scores.json")
+    return validate(out / "train" / "best.ckpt", out / "data", out / "train" / "scores.json")
 
 
 def _export(out: Path) -> None:

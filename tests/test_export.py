@@ -1,22 +1,25 @@
 """A checkpoint becomes an ONNX file that equals it, or no file."""
 
+import copy
 import dataclasses
 import json
 import shutil
 import subprocess
 import sys
 
+import coco_toys as toys
 import cv2
 import numpy as np
 import pytest
 import torch
 
-import cohdc_train.export as export_module
 from cohdc_train import signature
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError, ContractError, ExportError
-from cohdc_train.export import export
-from cohdc_train.models import detect
+from cohdc_train.export import command, export, parity
+from cohdc_train.export.graph import count_flops
+from cohdc_train.export.pictures import drawn_images
+from cohdc_train.models import MaskRCNN, detect
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule
 
@@ -37,13 +40,51 @@ def exported(checkpoint):
     return export(checkpoint)
 
 
-def test_the_file_is_reported_equal_at_two_sizes_two_batches_and_without_detections(exported):
-    report = json.loads(exported.with_name("model.onnx.json").read_text())
-    assert len({tuple(case["size"]) for case in report["cases"]}) >= 2
-    assert {case["batch"] for case in report["cases"]} == {1, 2}
+@pytest.fixture
+def written(exported, monkeypatch):
+    """The file that was exported once, in the place of what torch's exporter would write again."""
+
+    def write(network, class_names, path):
+        shutil.copyfile(exported, path)
+        return 0
+
+    monkeypatch.setattr(command, "write_graph", write)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A COCO-format folder of the classes of the checkpoint."""
+    root = tmp_path_factory.mktemp("data")
+    toys.folder(root)
+    return root
+
+
+def _report(file):
+    return json.loads(file.with_name(file.name + ".json").read_text())
+
+
+def test_the_file_is_reported_equal_at_three_sizes_three_batches_without_detections_and_full(exported, opinionated):
+    report = _report(exported)
+    assert len({tuple(case["size"]) for case in report["cases"]}) >= 3
+    assert {case["batch"] for case in report["cases"]} == {1, 2, 4}
+    assert report["most_detections"] == opinionated.config.detections
     assert report["detections_compared"] > 20
     for name, limit in {"boxes": 1e-2, "scores": 1e-4, "masks": 1e-3}.items():
         assert report["max_difference"][name] <= limit
+    assert report["mask_iou_min"] >= 0.99
+    assert report["bytes"] == exported.stat().st_size
+
+
+def test_gflops_of_a_detection_by_hand(exported, opinionated, small_config):
+    """Four 3x3 convolutions on 14x14 cells, a deconvolution to 28x28, and a 1x1 for background and two classes."""
+    without_cqe = count_flops(MaskRCNN(2, dataclasses.replace(small_config, cqe="off")).eval())
+    c, cells = small_config.fpn_channels, 14 * 14
+    flops = 2 * (4 * 9 * c * c * cells + 4 * c * c * cells + c * 3 * 4 * cells)
+    assert without_cqe.detection == pytest.approx(flops / 1e9)
+    whole, report = count_flops(opinionated), _report(exported)
+    assert whole.detection > without_cqe.detection
+    assert whole.image == pytest.approx(without_cqe.image)
+    assert report["gflops_image"] == pytest.approx(whole.image, abs=1e-3)
 
 
 def test_metadata_and_shapes_keep_the_contract(exported):
@@ -95,31 +136,127 @@ def test_every_form_of_mask_and_quality_head_exports(cqe, side, opinionated, tmp
     assert report["max_difference"]["quality"] <= 1e-3
 
 
-def test_a_file_that_differs_is_not_left_behind(checkpoint, exported, tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_a_hundred_detections_in_one_image(opinionated, tmp_path):
+    config = dataclasses.replace(
+        opinionated.config, detections=100, proposals=(400, 300), nms_iou=0.8, score_threshold=0.3
+    )
+    module = MaskRCNNModule(["person", "car"], config)
+    module.network.load_state_dict(opinionated.state_dict())
+    torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / "many.ckpt")
+    assert _report(export(tmp_path / "many.ckpt"))["most_detections"] == 100
+
+
+def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, monkeypatch):
     """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the folder."""
 
-    def write_the_exported_file(network, class_names, path):
-        shutil.copyfile(exported, path)
-        return 0
-
-    monkeypatch.setattr(export_module, "_write_onnx", write_the_exported_file)
-    monkeypatch.setattr(export_module, "TOLERANCES", {**export_module.TOLERANCES, "masks": 0.0})
+    monkeypatch.setitem(parity.TOLERANCES, "masks", 0.0)
     with pytest.raises(ExportError, match=r"m\.onnx: masks differ from torch by"):
+        export(checkpoint, tmp_path / "m.onnx")
+    monkeypatch.setitem(parity.TOLERANCES, "masks", 1e-3)
+    monkeypatch.setattr(parity, "LEAST_MASK_IOU", 1.01)
+    with pytest.raises(ExportError, match=r"m\.onnx: a mask's IoU with torch's is .* at least 1.01 wanted"):
         export(checkpoint, tmp_path / "m.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_wrong_output_is_seen(opinionated, exported):
+def test_wrong_masks_and_other_detections_are_seen(opinionated, exported):
     """The comparison fails when the network that is compared is not the one in the file."""
-    changed = torch.nn.Module.requires_grad_(opinionated, True)
-    pictures = export_module._drawn_images()
-    with torch.inference_mode():
-        same = export_module._compare(opinionated, exported, pictures)["max_difference"]
-        weight = changed.roi_heads.mask_predictor.mask_fcn_logits.weight
-        weight.data.mul_(1.1)
-        other = export_module._compare(changed, exported, pictures)["max_difference"]
-        weight.data.div_(1.1)
-    assert same["masks"] <= 1e-3 < other["masks"]
+    pictures = drawn_images(2)
+    parity.compare(opinionated, exported, pictures).require(exported)
+    other = copy.deepcopy(opinionated)
+    other.roi_heads.mask_predictor.mask_fcn_logits.weight.data.mul_(1.1)
+    assert parity.compare(other, exported, pictures).max_difference["masks"] > 1e-3
+    other.roi_heads.box_predictor.cls_score.weight.data.mul_(3)
+    with pytest.raises(ExportError, match="finds other objects than torch"):
+        parity.compare(other, exported, pictures).require(exported)
+
+
+def test_verify_only_finds_the_checkpoint_and_sees_that_it_changed(checkpoint, exported, tmp_path, capsys):
+    kept = tmp_path / "best.ckpt"
+    shutil.copyfile(checkpoint, kept)
+    file, report = tmp_path / "model.onnx", _report(exported)
+    shutil.copyfile(exported, file)
+    file.with_name("model.onnx.json").write_text(json.dumps(report | {"checkpoint": "best.ckpt"}))
+    before = sorted(p.name for p in tmp_path.iterdir())
+    assert main(["export", "--verify-only", str(file)]) == 0
+    assert "equals torch on" in capsys.readouterr().out
+    assert main(["export", str(kept), "--out", str(file), "--verify-only"]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+    content = torch.load(kept)
+    content["state_dict"]["network.roi_heads.mask_predictor.mask_fcn_logits.weight"] *= 1.1
+    torch.save(content, kept)
+    assert main(["export", "--verify-only", str(file)]) == 1
+    assert "has changed since the export" in capsys.readouterr().err
+    assert main(["export", str(kept), "--out", str(file), "--verify-only"]) == 1
+    assert "masks differ from torch by" in capsys.readouterr().err
+    kept.unlink()
+    assert main(["export", "--verify-only", str(file)]) == 1
+    assert "is gone" in capsys.readouterr().err
+    file.with_name("model.onnx.json").unlink()
+    assert main(["export", "--verify-only", str(file)]) == 1
+    assert "names no checkpoint" in capsys.readouterr().err
+
+
+def test_int8_keeps_the_contract_and_says_what_it_scores(checkpoint, written, folder, tmp_path):
+    import onnx
+
+    out = tmp_path / "model.onnx"
+    export(checkpoint, out, data=folder, int8=folder / "images")
+    whole, small = _report(out), _report(tmp_path / "model.int8.onnx")
+    assert whole["scores"]["torch"] == pytest.approx(whole["scores"]["onnx"], abs=1e-3, nan_ok=True)
+    assert whole["scores"]["onnx"] == small["scores"]["float32"]
+    assert small["bytes"] < 0.6 * whole["bytes"]
+    graph = onnx.load(tmp_path / "model.int8.onnx").graph
+    made = {output: node for node in graph.node for output in node.output}
+    fed = {node.name: made[node.input[0]].op_type for node in graph.node if node.op_type in ("Conv", "ConvTranspose")}
+    weights = {node.name: node.input[1] for node in graph.node if node.op_type in ("Conv", "ConvTranspose")}
+    floats = [name for name, origin in fed.items() if origin != "DequantizeLinear"]
+    assert floats
+    assert all("mask_predictor" in weights[name] or "cqe" in weights[name] for name in floats)
+    assert len(fed) > 5 * len(floats)
+    assert Segmenter(tmp_path / "model.int8.onnx")(drawn_images(1)[0]).class_names == ("person", "car")
+    assert main(["export", "--verify-only", str(tmp_path / "model.int8.onnx")]) == 1
+
+
+def test_int8_that_loses_too_much_is_refused(checkpoint, written, folder, tmp_path, monkeypatch):
+    scores = {"model.onnx": 0.5, "model.int8.onnx": 0.48}
+
+    class Judge:
+        def __init__(self, *_):
+            pass
+
+        def network(self):
+            return dict.fromkeys(command.SCORES, scores["model.onnx"])
+
+        def file(self, path):
+            return dict.fromkeys(command.SCORES, scores[path.name.lstrip(".").rsplit(".", 2)[0].removesuffix(".tmp")])
+
+    monkeypatch.setattr(command, "Scorer", Judge)
+    calibration = folder / "images"
+    with pytest.raises(CohdcError, match=r"int8 needs --data"):
+        export(checkpoint, tmp_path / "model.onnx", int8=calibration)
+    with pytest.raises(ExportError, match=r"model\.int8\.onnx: mask AP falls by 0\.020 in int8, allowed 0\.01"):
+        export(checkpoint, tmp_path / "model.onnx", data=folder, int8=calibration)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.onnx", "model.onnx.json"]
+    export(checkpoint, tmp_path / "model.onnx", data=folder, int8=calibration, allow_drop=True)
+    assert (tmp_path / "model.int8.onnx").is_file()
+
+
+def test_a_file_that_scores_otherwise_is_refused(checkpoint, written, folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(command.Scorer, "file", lambda self, path: dict.fromkeys(command.SCORES, 0.5))
+    with pytest.raises(ExportError, match=r"m\.onnx: mask AP differs from torch's by"):
+        export(checkpoint, tmp_path / "m.onnx", data=folder)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_validate_takes_the_file(exported, folder, tmp_path, capsys):
+    assert main(["validate", str(exported), str(folder), "--out", str(tmp_path / "scores.json")]) == 0
+    assert "boundary_AP" in capsys.readouterr().out
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert 0 <= scores["segm_AP50"] <= 1
+    assert main(["validate", str(exported), str(folder), "--canvas", "[64,64]"]) == 1
+    assert "its canvas was fixed by cohdc export" in capsys.readouterr().err
 
 
 def test_bad_checkpoints_and_folders_are_one_line(tmp_path, checkpoint, capsys):

@@ -1,4 +1,4 @@
-"""`cohdc fit` (Lightning's command line) and `cohdc validate`."""
+"""`cohdc fit`: Lightning's command line with this project's defaults."""
 
 import warnings
 from collections.abc import Iterator
@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from jsonargparse import auto_cli
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
@@ -16,12 +15,11 @@ from lightning.pytorch.utilities import rank_zero_info
 
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
-from cohdc_train.files import write_json
 from cohdc_train.presets import config_path
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.ema import ema
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.pictures import ValidationPictures, draw_validation, write_files
+from cohdc_train.train.pictures import ValidationPictures
 
 _USAGE = "cohdc fit --data.root DIR [--config FILE.yaml] [--out DIR] [--print_config] [--OPTION VALUE ...]"
 _DESCRIPTION = "Train an HDC Mask R-CNN with CQE on COCO-format data."
@@ -44,7 +42,7 @@ def fit(args: list[str]) -> Trainer:
     `pictures/` (of best.ckpt; `pictures/last/` of the last validation; none with `--pictures false`).
     Raises CohdcError in one line for whatever the user can mend; a wrong key ends the program with code 2.
     """
-    with _told_in_one_line():
+    with told_in_one_line():
         command = FitCommand(
             MaskRCNNModule,
             CocoDataModule,
@@ -59,57 +57,6 @@ def fit(args: list[str]) -> Trainer:
         )
         command.run()
     return command.trainer
-
-
-def validate(args: list[str]) -> None:
-    """Score a checkpoint: the arguments of `score`."""
-    with _told_in_one_line():
-        auto_cli(score, args=args, prog="cohdc validate", as_positional=True)
-
-
-def score(
-    checkpoint: Path,
-    root: Path,
-    out: Path | None = None,
-    rescore: bool | None = None,
-    min_quality: float = 0.0,
-    batch_size: int = 2,
-    workers: int = 1,
-    precision: str = "32-true",
-    canvas: tuple[int, int] | None = None,
-    pictures: Path | None = None,
-) -> dict[str, float]:
-    """Print a checkpoint's scores on the validation split of a COCO-format folder.
-
-    Args:
-        checkpoint: best.ckpt or last.ckpt of a training.
-        root: the COCO-format folder; its other classes are left out.
-        out: JSON file for the scores.
-        rescore: rank masks by score * quality; the training's choice when not given.
-        min_quality: leave out detections of a lower quality, as the paper does below 0.9.
-        batch_size: images per batch.
-        workers: processes that read images.
-        precision: Lightning's precision, such as bf16-mixed.
-        canvas: height and width in px to fit images into; the training's when not given.
-        pictures: folder for best.jpg, worst.jpg, pr_curves.png, calibration.png and confusion.png.
-    """
-    module = MaskRCNNModule.load(checkpoint, canvas)
-    module.rescore = module.rescore if rescore is None else rescore
-    module.min_quality = min_quality
-    data = CocoDataModule(root, module.class_names, module.network_config.canvas, batch_size, workers)
-    if data.class_names != module.class_names:
-        raise CohdcError(f"{root}: class order {data.class_names} is not the checkpoint's {module.class_names}")
-    trainer = Trainer(logger=False, enable_checkpointing=False, precision=precision, enable_model_summary=False)  # type: ignore[arg-type]
-    (scores,) = trainer.validate(module, datamodule=data, verbose=False)
-    results = {name.removeprefix("val/"): value for name, value in scores.items()}
-    for name, value in results.items():
-        print(f"{name:<24}{value:.4f}")
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, results)
-    if pictures is not None and module.results is not None:
-        write_files(pictures, draw_validation(module.results, data.folder.val.images))
-    return results
 
 
 class FitCommand(LightningCLI):
@@ -206,7 +153,7 @@ def _resolve_configs(args: list[str]) -> list[str]:
 
 
 @contextmanager
-def _told_in_one_line() -> Iterator[None]:
+def told_in_one_line() -> Iterator[None]:
     """Turn what a user can cause (bad values, files, a reader's error in a worker process) into a CohdcError."""
     with warnings.catch_warnings():
         for message in _ADVICE:

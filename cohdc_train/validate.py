@@ -1,0 +1,108 @@
+"""`cohdc validate`: the scores of a checkpoint or an ONNX file on COCO-format data."""
+
+from pathlib import Path
+
+import torch
+from lightning.pytorch import Trainer
+
+from cohdc_train.data.annotations import read_image
+from cohdc_train.data.coco import CocoSplit
+from cohdc_train.data.datamodule import CocoDataModule
+from cohdc_train.errors import CohdcError
+from cohdc_train.files import write_json
+from cohdc_train.segmenter import Segmenter
+from cohdc_train.train.cli import told_in_one_line
+from cohdc_train.train.metrics import Results, SegmentationMetrics
+from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.train.pictures import draw_validation, write_files
+
+
+def validate(
+    model: Path,
+    root: Path,
+    out: Path | None = None,
+    rescore: bool | None = None,
+    min_quality: float = 0.0,
+    batch_size: int = 2,
+    workers: int = 1,
+    precision: str = "32-true",
+    canvas: tuple[int, int] | None = None,
+    pictures: Path | None = None,
+    threads: int = 0,
+) -> dict[str, float]:
+    """Print a model's scores on the validation split of a COCO-format folder.
+
+    Args:
+        model: best.ckpt or last.ckpt of a training, or an ONNX file.
+        root: the COCO-format folder; its other classes are left out.
+        out: JSON file for the scores.
+        rescore: rank masks by score * quality; the training's choice when not given, yes for an ONNX file.
+        min_quality: leave out detections of a lower quality, as the paper does below 0.9.
+        batch_size: images per batch; an ONNX file takes one at a time.
+        workers: processes that read images for a checkpoint.
+        precision: Lightning's precision for a checkpoint, such as bf16-mixed.
+        canvas: height and width in px to fit images into; the training's when not given. An ONNX file has its own.
+        pictures: folder for best.jpg, worst.jpg, pr_curves.png, calibration.png and confusion.png.
+        threads: onnxruntime's threads; 0 leaves it to onnxruntime.
+
+    Raises:
+        CohdcError: the model, the folder or their classes cannot be used.
+    """
+    if model.suffix == ".onnx":
+        if canvas is not None:
+            raise CohdcError(f"{model}: its canvas was fixed by cohdc export --canvas")
+        segmenter = Segmenter(model, threads)
+        data = validation_data(root, model, list(segmenter.class_names), segmenter.canvas, batch_size, 0)
+        data.setup("validate")
+        results = score_segmenter(segmenter, data.folder.val, rescore is not False, min_quality)
+    else:
+        module = MaskRCNNModule.load(model, canvas)
+        data = validation_data(root, model, module.class_names, module.network_config.canvas, batch_size, workers)
+        results = score_module(module, data, rescore, min_quality, precision)
+    for name, value in results.scores.items():
+        print(f"{name:<24}{value:.4f}")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, results.scores)
+    if pictures is not None:
+        write_files(pictures, draw_validation(results, data.folder.val.images))
+    return results.scores
+
+
+def validation_data(
+    root: Path, model: Path, class_names: list[str], canvas: tuple[int, int], batch_size: int = 2, workers: int = 0
+) -> CocoDataModule:
+    """A folder's data with the classes of a model. Raises CohdcError when they stand in another order there."""
+    data = CocoDataModule(root, class_names, canvas, batch_size, workers)
+    if data.class_names != class_names:
+        raise CohdcError(f"{root}: class order {data.class_names} is not that of {model}: {class_names}")
+    return data
+
+
+def score_module(
+    module: MaskRCNNModule,
+    data: CocoDataModule,
+    rescore: bool | None = None,
+    min_quality: float = 0.0,
+    precision: str = "32-true",
+) -> Results:
+    """What a network finds on the validation split, and its scores. rescore: None is the training's choice."""
+    module.rescore = module.rescore if rescore is None else rescore
+    module.min_quality = min_quality
+    with told_in_one_line():
+        trainer = Trainer(logger=False, enable_checkpointing=False, precision=precision, enable_model_summary=False)  # type: ignore[arg-type]
+        trainer.validate(module, datamodule=data, verbose=False)
+    if module.results is None:
+        raise RuntimeError("validation left no results")
+    return module.results
+
+
+def score_segmenter(segmenter: Segmenter, split: CocoSplit, rescore: bool = True, min_quality: float = 0.0) -> Results:
+    """What an ONNX file finds on a split whose classes are its own, and its scores."""
+    metrics = SegmentationMetrics(split.ground_truth(), rescore, min_quality)
+    for image in split.images:
+        found = segmenter(read_image(image))
+        fields = {name: getattr(found, name) for name in ("boxes", "labels", "scores", "quality")}
+        fields["masks"] = found.roi_masks
+        metrics.update(image.id, {name: torch.from_numpy(value) for name, value in fields.items()})
+    return metrics.results()
