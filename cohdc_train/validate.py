@@ -1,7 +1,9 @@
 """`cohdc validate`: the scores of a checkpoint or an ONNX file on COCO-format data."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from lightning.pytorch import Trainer
 
@@ -34,7 +36,7 @@ def validate(
 
     Args:
         model: best.ckpt or last.ckpt of a training, or an ONNX file.
-        root: the COCO-format folder; its other classes are left out.
+        root: the COCO-format folder; its other classes are left out. Of an ONNX file, those that both have are scored.
         out: JSON file for the scores.
         rescore: rank masks by score * quality; the training's choice when not given, yes for an ONNX file.
         min_quality: leave out detections of a lower quality, as the paper does below 0.9.
@@ -52,12 +54,12 @@ def validate(
         if canvas is not None:
             raise CohdcError(f"{model}: its canvas was fixed by cohdc export --canvas")
         segmenter = Segmenter(model, threads)
-        data = validation_data(root, model, list(segmenter.class_names), segmenter.canvas, batch_size, 0)
+        data = CocoDataModule(root, _common_classes(root, model, segmenter.class_names))
         data.setup("validate")
         results = score_segmenter(segmenter, data.folder.val, rescore is not False, min_quality)
     else:
         module = MaskRCNNModule.load(model, canvas)
-        data = validation_data(root, model, module.class_names, module.network_config.canvas, batch_size, workers)
+        data = validation_data(root, model, module.class_names, batch_size, workers)
         results = score_module(module, data, rescore, min_quality, precision)
     for name, value in results.scores.items():
         print(f"{name:<24}{value:.4f}")
@@ -70,13 +72,22 @@ def validate(
 
 
 def validation_data(
-    root: Path, model: Path, class_names: list[str], canvas: tuple[int, int], batch_size: int = 2, workers: int = 0
+    root: Path, model: Path, class_names: list[str], batch_size: int = 2, workers: int = 0
 ) -> CocoDataModule:
     """A folder's data with the classes of a model. Raises CohdcError when they stand in another order there."""
-    data = CocoDataModule(root, class_names, canvas, batch_size, workers)
+    data = CocoDataModule(root, class_names, batch_size=batch_size, workers=workers)
     if data.class_names != class_names:
         raise CohdcError(f"{root}: class order {data.class_names} is not that of {model}: {class_names}")
     return data
+
+
+def _common_classes(root: Path, model: Path, names: Sequence[str]) -> list[str]:
+    """The folder's classes that an ONNX file knows too. Raises CohdcError when there is none."""
+    known = CocoDataModule(root).class_names
+    common = [name for name in known if name in names]
+    if not common:
+        raise CohdcError(f"{model}: none of its {len(names)} classes is one of {root}: {', '.join(known)}")
+    return common
 
 
 def score_module(
@@ -98,11 +109,13 @@ def score_module(
 
 
 def score_segmenter(segmenter: Segmenter, split: CocoSplit, rescore: bool = True, min_quality: float = 0.0) -> Results:
-    """What an ONNX file finds on a split whose classes are its own, and its scores."""
+    """What an ONNX file finds of a split's classes, and its scores. Every class of the split is one of the file's."""
     metrics = SegmentationMetrics(split.ground_truth(), rescore, min_quality)
+    labels = {segmenter.class_names.index(name): label for label, name in enumerate(split.class_names)}
     for image in split.images:
         found = segmenter(read_image(image))
-        fields = {name: getattr(found, name) for name in ("boxes", "labels", "scores", "quality")}
-        fields["masks"] = found.roi_masks
+        found = found.select(np.isin(found.labels, list(labels)))
+        fields = {name: getattr(found, name) for name in ("boxes", "scores", "quality")}
+        fields |= {"labels": np.array([labels[label] for label in found.labels], np.int64), "masks": found.roi_masks}
         metrics.update(image.id, {name: torch.from_numpy(value) for name, value in fields.items()})
     return metrics.results()

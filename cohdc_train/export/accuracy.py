@@ -24,7 +24,7 @@ class Scorer:
 
     def __init__(self, module: MaskRCNNModule, root: Path, checkpoint: Path) -> None:
         self._module = module
-        self._data = validation_data(root, checkpoint, module.class_names, module.network_config.canvas)
+        self._data = validation_data(root, checkpoint, module.class_names)
 
     def network(self) -> dict[str, float]:
         """SCORES by torch, float32."""

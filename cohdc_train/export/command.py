@@ -153,7 +153,7 @@ def _checkpoint_of(file: Path) -> Path:
     return checkpoint
 
 
-def _canvas_of(file: Path) -> tuple[int, int]:
+def _canvas_of(file: Path) -> tuple[int, int] | None:
     return Segmenter(file).canvas
 
 
