@@ -1,9 +1,10 @@
-"""`cohdc predict`: images, a folder of them or a video through an ONNX -> overlays and one COCO file (no torch)."""
+"""`cohdc predict`: images, folders, videos or a webcam through an ONNX -> overlays and one COCO file (no torch)."""
 
 import json
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -22,6 +23,7 @@ IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".
 VIDEO_SUFFIXES = frozenset([".mp4", ".avi", ".mkv", ".mov", ".webm"])
 # RGB; neighbours in the list differ in hue, so that people side by side can be told apart
 _COLOURS = ((230, 25, 75), (60, 180, 75), (0, 130, 200), (245, 130, 48), (145, 30, 180), (70, 240, 240), (240, 50, 230))
+_WEBCAM_FRAMES = 100
 _FILL = 0.45  # share of the colour in a filled mask
 
 
@@ -51,23 +53,25 @@ def predict(
     quality: float | None = None,
     iou_floor: float = 0.95,
     threads: int = 0,
+    frames: int | None = None,
 ) -> dict[str, Any]:
-    """Find objects in an image, a folder of images or a video.
+    """Find objects in an image, a folder of images, a video or a webcam's pictures.
 
     Writes `<name>_overlay.jpg` per image and predictions.json, a COCO file with score and quality per annotation.
     Returns the content of predictions.json. Raises DataError for images that cannot be read, ContractError for a model
     that does not keep the contract.
 
     Args:
-        source: an image, a folder of images, or a video.
-        model: ONNX file written by `cohdc export`.
+        source: an image, a folder of images, a video, or a webcam's number such as 0.
+        model: ONNX file written by `cohdc export`, or a foreign one that is known.
         out: folder for the results.
         score: least class score that is kept.
         quality: least mask quality that is kept; without it nothing is dropped for its quality.
         iou_floor: least IoU of a written polygon with its mask; 1 keeps every pixel.
         threads: onnxruntime's threads; 0 leaves it to onnxruntime.
+        frames: most pictures that are looked at; when not given all there are, and 100 of a webcam.
     """
-    pictures = read_pictures(source)
+    pictures = read_pictures(source, frames)
     network = Segmenter(model, threads)
     started = time.perf_counter()
     result = predict_pictures(pictures, network, out, (score, quality), iou_floor)
@@ -133,11 +137,20 @@ def _area(ring: NDArray[np.float64]) -> float:
     return float(abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2)
 
 
-def read_pictures(source: Path) -> Iterator[Picture]:
-    """The images behind a path, read one at a time: a file, a folder (by name, not its subfolders) or a video's frames.
+def read_pictures(source: Path, most: int | None = None) -> Iterator[Picture]:
+    """The images behind a path, read one at a time: a file, a folder (by name, not its subfolders), a video's frames or
+    those of the webcam of that number. most: how many at most; None is all, and 100 of a webcam.
 
     Raises DataError at once when there is nothing to read, and on the way for an image that cannot be decoded.
     """
+    if most is not None and most < 1:
+        raise DataError(f"frames is {most}; at least 1 is needed")
+    if source.name.isdigit() and not source.exists():
+        return islice(_frames(Path(f"webcam{source.name}"), int(source.name)), most or _WEBCAM_FRAMES)
+    return islice(_stored(source), most)
+
+
+def _stored(source: Path) -> Iterator[Picture]:
     if source.is_dir():
         files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
@@ -146,7 +159,7 @@ def read_pictures(source: Path) -> Iterator[Picture]:
     if not source.is_file():
         raise DataError(f"{source}: no such file or folder")
     if source.suffix.lower() in VIDEO_SUFFIXES:
-        return _frames(source)
+        return _frames(source, str(source))
     return _images([source])
 
 
@@ -161,15 +174,18 @@ def _images(files: list[Path]) -> Iterator[Picture]:
         yield Picture(file.name, f"{name}_overlay.jpg", _rgb(bgr))
 
 
-def _frames(file: Path) -> Iterator[Picture]:
-    video = cv2.VideoCapture(str(file))
+def _frames(file: Path, origin: str | int) -> Iterator[Picture]:
+    video = cv2.VideoCapture(origin)
     index = 0
-    while (frame := video.read())[0]:
-        name = f"{file.stem}_{index:06d}"
-        yield Picture(f"{name}.jpg", f"{name}_overlay.jpg", _rgb(frame[1]))
-        index += 1
+    try:
+        while (frame := video.read())[0]:
+            name = f"{file.stem}_{index:06d}"
+            yield Picture(f"{name}.jpg", f"{name}_overlay.jpg", _rgb(frame[1]))
+            index += 1
+    finally:
+        video.release()
     if not index:
-        raise DataError(f"{file}: cannot be decoded as a video")
+        raise DataError(f"{file}: no picture comes out of it")
 
 
 def _rgb(bgr: Any) -> Image:

@@ -124,6 +124,36 @@ def test_video_frames_are_read(tmp_path: Path) -> None:
     assert [round(float(frame.rgb.mean()), -1) for frame in frames] == [10, 120, 230]
 
 
+class _Webcam:
+    """In the place of OpenCV's: number 0 gives grey pictures without end, others none."""
+
+    released = 0
+
+    def __init__(self, origin: object) -> None:
+        self.works = origin == 0
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        return (True, np.full((48, 64, 3), 90, np.uint8)) if self.works else (False, None)
+
+    def release(self) -> None:
+        _Webcam.released += 1
+
+
+def test_a_webcam_is_a_number_and_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", _Webcam)
+    monkeypatch.chdir(tmp_path)
+    assert [picture.name for picture in read_pictures(Path("0"), 2)] == ["webcam0_000000.jpg", "webcam0_000001.jpg"]
+    assert len(list(read_pictures(Path("0")))) == 100
+    with pytest.raises(DataError, match=r"webcam7: no picture comes out of it"):
+        list(read_pictures(Path("7")))
+    with pytest.raises(DataError, match="frames is 0"):
+        read_pictures(Path("0"), 0)
+    assert _Webcam.released == 3
+    Path("0").mkdir()
+    with pytest.raises(DataError, match="holds no image"):  # a folder of that name is that folder
+        read_pictures(Path("0"))
+
+
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"absent: no such file"):
         read_pictures(tmp_path / "absent")
