@@ -17,10 +17,11 @@ from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss
 from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
-from cohdc_train.models.backbones import Depth, HDCResNet, load_backbone_weights
 from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss
 from cohdc_train.models.cqe_targets import Goal, band_of, cqe_targets
 from cohdc_train.models.mask_head import MaskSize, mask_loss, mask_predictor
+from cohdc_train.models.mobilenet import MobileNetV1
+from cohdc_train.models.resnet import Depth, HDCResNet
 from cohdc_train.models.rpn import build_rpn, in_crowd
 from cohdc_train.models.true_masks import TrueMasks
 
@@ -35,12 +36,13 @@ class NetworkConfig:
     """Everything that shapes the network; the number of classes comes from the data.
 
     Attributes:
-        depth: ResNet of 18, 34 or 50 layers.
+        backbone: "resnet", or "mobilenet_v1", which has one depth.
+        depth: ResNet of 18, 34, 50 or 101 layers.
         width: channels of the backbone as a share of ResNet's.
         rates: dilation patterns of the four stages.
         weights: torchvision name or local path of ImageNet weights for the backbone; None trains from scratch.
         norm: "batch" trains BatchNorm, in the pyramid too; "frozen" keeps the weights' statistics.
-        frozen_stages: how many of stem, layer1 .. layer4 are not trained.
+        frozen_stages: how many of the stem and the four stages are not trained.
         canvas: (height, width) in px every image is fitted into.
         anchor_scales: side of the anchors in px, one per pyramid level from stride 4; a fifth adds the pool level.
         fpn_channels: width of the pyramid, and of the RPN and mask heads.
@@ -57,6 +59,7 @@ class NetworkConfig:
         nms_iou: overlap from which the weaker of two detections of a class is dropped.
     """
 
+    backbone: Literal["resnet", "mobilenet_v1"] = "resnet"
     depth: Depth = 50
     width: float = 1.0
     rates: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3))
@@ -86,13 +89,14 @@ class NetworkConfig:
 
 
 class Backbone(nn.Module):
-    """HDC ResNet and feature pyramid, under the names that torchvision's BackboneWithFPN uses."""
+    """HDC stages and feature pyramid, under the names that torchvision's BackboneWithFPN uses."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.body = HDCResNet(config.depth, config.width, config.rates, config.norm, config.frozen_stages)
+        shape = (config.width, config.rates, config.norm, config.frozen_stages)
+        self.body = HDCResNet(config.depth, *shape) if config.backbone == "resnet" else MobileNetV1(*shape)
         if config.weights is not None:
-            load_backbone_weights(self.body, config.depth, config.weights)
+            self.body.load(config.weights)
         pool = LastLevelMaxPool() if len(config.anchor_scales) == 5 else None
         norm = nn.BatchNorm2d if config.norm == "batch" else None
         self.fpn = FeaturePyramidNetwork(self.body.out_channels, config.fpn_channels, pool, norm)

@@ -6,7 +6,9 @@ from torchvision.models import resnet18, resnet50
 from torchvision.models.feature_extraction import create_feature_extractor
 from torchvision.ops import FrozenBatchNorm2d
 
-from cohdc_train.models.backbones import FrozenNorm, HDCResNet, load_backbone_weights
+from cohdc_train.models.mobilenet import MobileNetV1
+from cohdc_train.models.resnet import HDCResNet
+from cohdc_train.models.staged import FrozenNorm
 
 PLAIN = ((1,),) * 4
 
@@ -17,7 +19,7 @@ def test_undilated_it_computes_what_torchvisions_resnet_computes(tmp_path, depth
     reference = build(weights=None).eval()
     torch.save(reference.state_dict(), tmp_path / "weights.pth")
     backbone = HDCResNet(depth, rates=PLAIN).eval()
-    load_backbone_weights(backbone, depth, str(tmp_path / "weights.pth"))
+    backbone.load(str(tmp_path / "weights.pth"))
     image = torch.rand(1, 3, 64, 96)
     stages = create_feature_extractor(reference, {f"layer{i + 1}": str(i) for i in range(4)})(image)
     features = backbone(image)
@@ -25,7 +27,7 @@ def test_undilated_it_computes_what_torchvisions_resnet_computes(tmp_path, depth
         torch.testing.assert_close(features[name], stages[name])
 
 
-@pytest.mark.parametrize("depth", [18, 34, 50])
+@pytest.mark.parametrize("depth", [18, 34, 50, 101])
 def test_dilation_keeps_strides_and_channels(depth):
     backbone = HDCResNet(depth, width=0.25).eval()
     features = backbone(torch.zeros(1, 3, 64, 128))
@@ -65,12 +67,57 @@ def test_frozen_stages_learn_nothing_and_keep_their_statistics():
 def test_weights_of_another_depth_are_refused_by_name(tmp_path):
     torch.save(resnet50(weights=None).state_dict(), tmp_path / "r50.pth")
     with pytest.raises(ValueError, match=r"r50\.pth: layer1\.0\.conv1\.weight is \[64, 64, 1, 1\]"):
-        load_backbone_weights(HDCResNet(18), 18, str(tmp_path / "r50.pth"))
+        HDCResNet(18).load(str(tmp_path / "r50.pth"))
 
 
 def test_a_missing_file_lists_the_published_names(tmp_path):
     with pytest.raises(FileNotFoundError, match="IMAGENET1K_V1"):
-        load_backbone_weights(HDCResNet(18), 18, str(tmp_path / "nothing.pth"))
+        HDCResNet(18).load(str(tmp_path / "nothing.pth"))
+
+
+def test_mobilenets_strides_channels_and_pattern():
+    backbone = MobileNetV1(width=0.25, rates=((1, 2, 3),) * 4, frozen_stages=1).eval()
+    features = backbone(torch.zeros(1, 3, 64, 128))
+    assert [tuple(f.shape[1:]) for f in features.values()] == [(32, 16, 32), (64, 8, 16), (128, 4, 8), (256, 2, 4)]
+    # behind each strided convolution the pattern begins; the first stage has one before its stride
+    assert backbone.rates() == [(1, 1, 2), (1, 1), (1, 1, 2, 3, 1, 2), (1, 1)]
+    assert not any(p.requires_grad for p in backbone.stem_block.parameters())
+
+
+def test_mobilenets_receptive_field_is_what_a_gradient_reaches():
+    body = MobileNetV1(width=0.25).eval()
+    image = torch.rand(1, 3, 1024, 64, requires_grad=True)
+    body(image)["3"][0, :, 16, 1].sum().backward()
+    rows = image.grad.abs().sum(dim=(0, 1, 3)).nonzero()[:, 0]
+    assert int(rows.max() - rows.min()) + 1 == body.receptive_field() == 315
+
+
+def test_mobilenet_sees_pixels_from_minus_one_to_one_padded_below_and_right():
+    """With a stem that copies its kernel's last corner, the stem's output is the pixel below and to the right."""
+    body = MobileNetV1().eval()
+    with torch.no_grad():
+        body.stem_block.conv.weight.zero_()
+        body.stem_block.conv.weight[:, 1, 1, 1] = 1.0  # green, the kernel's centre: pixels 1, 3, 5 ...
+    green = torch.arange(64.0).repeat(64, 1) / 63
+    image = torch.stack([torch.zeros(64, 64), green, torch.zeros(64, 64)])
+    mean, std = torch.tensor([0.485, 0.456, 0.406])[:, None, None], torch.tensor([0.229, 0.224, 0.225])[:, None, None]
+    seen = body.stem(((image - mean) / std)[None])[0, 0, 0]
+    expected = (2 * green[0, 1::2] - 1).clamp(0, 6) / (1 + 1e-3) ** 0.5
+    torch.testing.assert_close(seen, expected, atol=1e-5, rtol=0)
+
+
+def test_mobilenets_weights_load_by_path_only(tmp_path):
+    source = MobileNetV1()
+    state = {name.replace("stem_block.", "stem."): value for name, value in source.state_dict().items()}
+    torch.save(state | {"fc.weight": torch.zeros(1)}, tmp_path / "m.pth")
+    target = MobileNetV1(norm="frozen")
+    target.load(str(tmp_path / "m.pth"))
+    assert torch.equal(target.blocks[12].pw.conv.weight, source.blocks[12].pw.conv.weight)
+    with pytest.raises(FileNotFoundError, match="torchvision publishes no MobileNetV1 weights"):
+        MobileNetV1().load("IMAGENET1K_V1")
+    torch.save({"fc.weight": torch.zeros(1)}, tmp_path / "empty.pth")
+    with pytest.raises(ValueError, match=r"empty\.pth: no tensor .* these are not MobileNetV1 weights"):
+        MobileNetV1().load(str(tmp_path / "empty.pth"))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,108 @@
+"""ResNets with hybrid dilated stages, parameter for parameter torchvision's (paper 2.1.1, Fig. 4)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from torch import Tensor, nn
+from torchvision.models import get_model_weights
+from torchvision.models.resnet import BasicBlock, Bottleneck
+
+from cohdc_train.models.staged import FrozenNorm, Rates, StagedBackbone, load_weights, read_weights
+
+Depth = Literal[18, 34, 50, 101]
+_BLOCKS: dict[int, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
+    18: (BasicBlock, (2, 2, 2, 2)),
+    34: (BasicBlock, (3, 4, 6, 3)),
+    50: (Bottleneck, (3, 4, 6, 3)),
+    101: (Bottleneck, (3, 4, 23, 3)),
+}
+
+
+class HDCResNet(StagedBackbone):
+    """ResNet whose 3x3 convolutions follow a dilation pattern inside each stage; strides stay 4, 8, 16, 32.
+
+    Dilation changes no tensor's shape, so ImageNet weights load unchanged. A stage's strided convolution keeps rate 1
+    and the pattern starts behind it: with the stride inside the pattern, (1, 2, 3) would skip every eighth pixel.
+
+    Args:
+        depth: 18, 34, 50 or 101.
+        width: channels as a share of ResNet's (64, 128, 256, 512 planes), rounded to multiples of 8.
+        rates: dilation pattern of each of the four stages, cycled over its convolutions; (1,) is a plain stage.
+        norm: "batch" trains BatchNorm, "frozen" keeps its statistics and scale (small batches, pretrained weights).
+        frozen_stages: how many of stem, layer1 .. layer4 are not trained, counted from the stem.
+
+    Raises:
+        ValueError: a pattern leaves holes (they are named), or there are not four patterns.
+    """
+
+    def __init__(
+        self,
+        depth: Depth,
+        width: float = 1.0,
+        rates: Rates = ((1, 2, 3),) * 4,
+        norm: Literal["batch", "frozen"] = "batch",
+        frozen_stages: int = 0,
+    ) -> None:
+        super().__init__()
+        self.depth: Depth = depth
+        block, blocks = _BLOCKS[depth]
+        norm_layer: Callable[..., nn.Module] = nn.BatchNorm2d if norm == "batch" else FrozenNorm
+        planes = [max(8, round(64 * width * 2**i / 8) * 8) for i in range(4)]
+        self.conv1 = nn.Conv2d(3, planes[0], 7, stride=2, padding=3, bias=False)
+        self.bn1 = norm_layer(planes[0])
+        self.relu = nn.ReLU(inplace=True)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        channels = planes[0]
+        for i in range(4):
+            stage = _stage(block, channels, planes[i], blocks[i], 1 if i == 0 else 2, norm_layer)
+            self.add_module(f"layer{i + 1}", stage)
+            channels = planes[i] * block.expansion
+        self.out_channels = [p * block.expansion for p in planes]
+        self.finish(rates, frozen_stages)
+
+    def parts(self) -> list[list[nn.Module]]:
+        return [[self.conv1, self.bn1], *([self.get_submodule(f"layer{i}")] for i in range(1, 5))]
+
+    def stem(self, x: Tensor) -> Tensor:
+        out: Tensor = self.maxpool(self.relu(self.bn1(self.conv1(x))))
+        return out
+
+    def field_of_stem(self) -> tuple[int, int]:
+        return 7 + 2 * 2, 4
+
+    def load(self, weights: str) -> None:
+        """Fill a full-width network with ImageNet weights.
+
+        weights: a torchvision name such as "IMAGENET1K_V1", or the path of a state dict (`fc.*` is passed over).
+        Raises ValueError naming the file and the first tensor that does not fit; FileNotFoundError when there is no
+        such file and no such name.
+        """
+        published = get_model_weights(f"resnet{self.depth}")
+        if Path(weights).is_file():
+            state = read_weights(weights)
+        elif weights in published.__members__:
+            state = published[weights].get_state_dict(progress=True)
+        else:
+            names = ", ".join(published.__members__)
+            raise FileNotFoundError(
+                f"{weights}: no such file, and torchvision's ResNet-{self.depth} weights are {names}"
+            )
+        load_weights(self, weights, state, f"ResNet-{self.depth}")
+
+
+def _stage(
+    block: type[BasicBlock] | type[Bottleneck],
+    channels: int,
+    planes: int,
+    blocks: int,
+    stride: int,
+    norm_layer: Callable[..., nn.Module],
+) -> nn.Sequential:
+    out = planes * block.expansion
+    shortcut = None
+    if stride != 1 or channels != out:
+        shortcut = nn.Sequential(nn.Conv2d(channels, out, 1, stride=stride, bias=False), norm_layer(out))
+    first = block(channels, planes, stride, shortcut, norm_layer=norm_layer)
+    rest = [block(out, planes, norm_layer=norm_layer) for _ in range(blocks - 1)]
+    return nn.Sequential(first, *rest)

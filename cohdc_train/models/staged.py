@@ -1,0 +1,136 @@
+"""What every backbone here is: a stem and four stages of strides 4, 8, 16, 32, whose 3x3 convolutions are dilated."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Self
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+from torchvision.ops import FrozenBatchNorm2d
+
+from cohdc_train.models.hdc import cycle
+
+Rates = Sequence[Sequence[int]]
+
+
+class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not typed
+    """Torchvision's, which in mixed precision turns every half-precision map into float32 and leaves it so."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.dtype == self.weight.dtype:
+            out: Tensor = super().forward(x)
+            return out
+        return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+
+
+class StagedBackbone(nn.Module):
+    """Base of the backbones; a subclass builds its parts and then calls `finish`.
+
+    Attributes:
+        out_channels: channels of the four stages.
+        frozen_stages: how many of the stem and the stages are not trained, counted from the stem.
+    """
+
+    out_channels: list[int]
+    frozen_stages = 0
+
+    def parts(self) -> list[list[nn.Module]]:
+        """The modules of the stem and of each stage, in the order in which they run."""
+        raise NotImplementedError
+
+    def stem(self, x: Tensor) -> Tensor:
+        """x: [B, 3, H, W], normalised by ImageNet's mean and deviation. Returns what the first stage takes."""
+        raise NotImplementedError
+
+    def field_of_stem(self) -> tuple[int, int]:
+        """(side of what a cell behind the stem sees, stride of the stem), px."""
+        raise NotImplementedError
+
+    def finish(self, rates: Rates, frozen_stages: int) -> None:
+        """Dilate, start from He's initialisation, freeze.
+
+        rates: dilation pattern of each of the four stages, cycled over its convolutions; (1,) is a plain stage.
+        Raises ValueError: a pattern leaves holes (they are named), or there are not four patterns.
+        """
+        if len(rates) != 4:
+            raise ValueError(f"HDC rates {tuple(rates)}: {len(rates)} patterns for 4 stages")
+        for stage, pattern in zip(self.parts()[1:], rates, strict=True):
+            dilate(stage, pattern)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        self.frozen_stages = frozen_stages
+        for frozen in self._frozen():
+            frozen.requires_grad_(False)
+
+    def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
+        """x: [B, 3, H, W], normalised; sides are multiples of 32. Returns {"0": stride 4, "1": 8, "2": 16, "3": 32}
+        feature maps.
+        """
+        x = self.stem(x)
+        features = OrderedDict()
+        for i, stage in enumerate(self.parts()[1:]):
+            for module in stage:
+                x = module(x)
+            features[str(i)] = x
+        return features
+
+    def rates(self) -> list[tuple[int, ...]]:
+        """Dilations of each stage's 3x3 convolutions, in their order."""
+        return [tuple(c.dilation[0] for c in _convolutions(stage)) for stage in self.parts()[1:]]
+
+    def receptive_field(self) -> int:
+        """Side, in px of the input, of what a cell of the last stage sees."""
+        side, jump = self.field_of_stem()
+        for stage in self.parts()[1:]:
+            for conv in _convolutions(stage):
+                side += 2 * conv.dilation[0] * jump
+                jump *= conv.stride[0]
+        return side
+
+    def train(self, mode: bool = True) -> Self:
+        """As nn.Module's, but frozen stages stay in evaluation mode, so that their BatchNorm statistics rest."""
+        super().train(mode)
+        for frozen in self._frozen():
+            frozen.eval()
+        return self
+
+    def _frozen(self) -> list[nn.Module]:
+        return [module for part in self.parts()[: self.frozen_stages] for module in part]
+
+
+def dilate(stage: Sequence[nn.Module], pattern: Sequence[int]) -> None:
+    """Set the dilation of a stage's 3x3 convolutions in place; those with a stride keep rate 1.
+
+    Raises ValueError naming the holes of a pattern that leaves some.
+    """
+    free = [conv for conv in _convolutions(stage) if conv.stride == (1, 1)]
+    for conv, rate in zip(free, cycle(pattern, len(free)), strict=True):
+        conv.dilation = conv.padding = (rate, rate)
+
+
+def load_weights(backbone: StagedBackbone, source: str, state: dict[str, Tensor], name: str) -> None:
+    """Fill a backbone with a state dict; what it has no place for (a classifier) is passed over.
+
+    source: where it came from; name: what it should be. Raises ValueError naming source and the first tensor that does
+    not fit.
+    """
+    own = backbone.state_dict()
+    for key in (key for key in own if not key.endswith("num_batches_tracked")):
+        if key not in state:
+            raise ValueError(f"{source}: no tensor {key}; these are not {name} weights")
+        if state[key].shape != own[key].shape:
+            raise ValueError(f"{source}: {key} is {list(state[key].shape)}, the backbone's {list(own[key].shape)}")
+    backbone.load_state_dict({key: value for key, value in state.items() if key in own}, strict=False)
+
+
+def read_weights(path: str) -> dict[str, Tensor]:
+    """A state dict that `torch.save` wrote."""
+    state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+    return state
+
+
+def _convolutions(stage: Sequence[nn.Module]) -> list[nn.Conv2d]:
+    found = (m for module in stage for m in module.modules())
+    return [m for m in found if isinstance(m, nn.Conv2d) and m.kernel_size == (3, 3)]
