@@ -26,6 +26,7 @@ VERBS = {
     "validate": Verb("validate", "validate", "score a checkpoint or an ONNX on a COCO-format folder"),
     "export": Verb("export", "export", "checkpoint -> ONNX, run and compared before it is kept"),
     "predict": Verb("predict", "predict", "run an ONNX on images: overlays and COCO JSON (no torch)"),
+    "bench": Verb("bench", "bench", "Table 4: networks trained, exported, scored and timed side by side"),
     "slam": Verb("slam.run", "slam", "RGB-D sequence -> trajectory, map tracking with people removed (no torch)"),
     "evaluate": Verb("trajectory", "evaluate", "ATE and RPE of a trajectory against ground truth"),
     "env": Verb("env", "env", "versions of everything that matters, and what is wrong with them"),

@@ -14,7 +14,7 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.cli import told_in_one_line
-from cohdc_train.train.metrics import Results, SegmentationMetrics
+from cohdc_train.train.metrics import Results, SegmentationMetrics, category_names
 from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.pictures import draw_validation, write_files
 
@@ -53,10 +53,7 @@ def validate(
     if model.suffix == ".onnx":
         if canvas is not None:
             raise CohdcError(f"{model}: its canvas was fixed by cohdc export --canvas")
-        segmenter = Segmenter(model, threads)
-        data = CocoDataModule(root, _common_classes(root, model, segmenter.class_names))
-        data.setup("validate")
-        results = score_segmenter(segmenter, data.folder.val, rescore is not False, min_quality)
+        results = score_file(model, root, rescore is not False, min_quality, threads)
     else:
         module = MaskRCNNModule.load(model, canvas)
         data = validation_data(root, model, module.class_names, batch_size, workers)
@@ -67,7 +64,8 @@ def validate(
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, results.scores)
     if pictures is not None:
-        write_files(pictures, draw_validation(results, data.folder.val.images))
+        split = CocoDataModule(root, category_names(results.truth)).folder.val
+        write_files(pictures, draw_validation(results, split.images))
     return results.scores
 
 
@@ -106,6 +104,17 @@ def score_module(
     if module.results is None:
         raise RuntimeError("validation left no results")
     return module.results
+
+
+def score_file(model: Path, root: Path, rescore: bool = True, min_quality: float = 0.0, threads: int = 0) -> Results:
+    """What an ONNX file finds of the classes that it and a folder's validation split have in common, and its scores.
+
+    Raises CohdcError when there is no such class, ContractError and DataError for file and folder.
+    """
+    segmenter = Segmenter(model, threads)
+    data = CocoDataModule(root, _common_classes(root, model, segmenter.class_names))
+    data.setup("validate")
+    return score_segmenter(segmenter, data.folder.val, rescore, min_quality)
 
 
 def score_segmenter(segmenter: Segmenter, split: CocoSplit, rescore: bool = True, min_quality: float = 0.0) -> Results:

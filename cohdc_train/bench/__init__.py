@@ -1,0 +1,80 @@
+"""`cohdc bench`: the paper's Table 4, one row per network, all under the same data, budget, seeds and threads."""
+
+from pathlib import Path
+from typing import Any
+
+
+def bench(
+    data: Path,
+    *,
+    out: Path,
+    rows: list[str] | None = None,
+    models: list[Path] | None = None,
+    fit_config: Path | None = None,
+    weights: dict[str, str] | None = None,
+    options: list[str] | None = None,
+    epochs: int | None = None,
+    train_minutes: float | None = None,
+    seeds: list[int] | None = None,
+    threads: int = 1,
+    images: int = 20,
+    int8: bool = True,
+) -> list[dict[str, Any]]:
+    """Train, export, score and time the rows of Table 4, and any finished model beside them.
+
+    Every row is trained on the same folder with the same budget and seeds, exported, quantised, scored on the
+    validation split by its ONNX file, and timed picture by picture in turn with the others, from uint8 image to masks
+    of the image. What is finished lies in OUT/ROW_seedN and is not done again. Writes table4.json, table4.csv,
+    table4.txt and table4.png.
+
+    Args:
+        data: COCO-format folder.
+        out: folder for everything that is written.
+        rows: names among HDC-Net, ResNet50, ResNet101 and MobileNetV1; all when left out. An empty list trains none.
+        models: checkpoints of `cohdc fit` and ONNX files, foreign ones too, as further rows.
+        fit_config: configuration file of `cohdc fit` for all rows; what makes a row is put over it.
+        weights: row -> ImageNet weights, by torchvision's name or as a file. Rows without start from random weights.
+        options: further arguments of `cohdc fit` for all rows, such as '["--data.canvas=[240,320]"]'.
+        epochs: budget of each training.
+        train_minutes: the budget as time instead, at a constant learning rate.
+        seeds: one training of every row for each; [0] when left out.
+        threads: of training, torch and onnxruntime.
+        images: validation pictures that are timed.
+        int8: quantise as well.
+
+    Returns:
+        The rows of table4.json.
+
+    Raises:
+        CohdcError: there is no such row, no budget or two, or a step failed; its log is named.
+    """
+    from cohdc_train.bench.table import run
+
+    return run(
+        data,
+        out,
+        rows=rows,
+        models=models or [],
+        options=_fit_options(fit_config, options or [], epochs, train_minutes),
+        weights=weights or {},
+        seeds=seeds or [0],
+        threads=threads,
+        images=images,
+        int8=int8,
+    )
+
+
+def _fit_options(
+    config: Path | None, options: list[str], epochs: int | None, train_minutes: float | None
+) -> tuple[str, ...]:
+    from cohdc_train.errors import CohdcError
+
+    if (epochs is None) == (train_minutes is None):
+        raise CohdcError(f"a budget is needed: --epochs or --train-minutes, not {'both' if epochs else 'none'}")
+    given = (f"--config={config}",) if config is not None else ()
+    if train_minutes is not None:
+        seconds = round(60 * train_minutes)
+        clock = f"00:{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}"
+        endless = ("--trainer.max_epochs=100000", "--model.optimizer.final_fraction=1")
+        return (*given, *options, f"--trainer.max_time={clock}", *endless)
+    return (*given, *options, f"--trainer.max_epochs={epochs}")

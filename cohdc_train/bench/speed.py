@@ -1,0 +1,105 @@
+"""How fast networks are from image to masks, in turn on the same pictures, and how much memory they take."""
+
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cohdc_train.errors import CohdcError
+from cohdc_train.models import detect
+from cohdc_train.segmenter import Detections, Segmenter
+from cohdc_train.train.module import MaskRCNNModule
+
+Image = NDArray[np.uint8]
+Runner = Callable[[Image], Detections]
+
+LIKELY = 0.5  # score from which a detection's mask is pasted
+_PEAK = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from cohdc_train.segmenter import Segmenter
+run = Segmenter(Path(sys.argv[1]), int(sys.argv[2]))
+image = np.load(sys.argv[3])
+for _ in range(3):
+    run(image).masks()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+class Rate(NamedTuple):
+    """Pictures per second: the median over the pictures, and the quartiles."""
+
+    median: float
+    low: float
+    high: float
+
+
+def torch_runner(checkpoint: Path) -> Runner:
+    """A checkpoint's network in torch, float32, in evaluation mode, read as the ONNX file is."""
+    module = MaskRCNNModule.load(checkpoint)
+    names = tuple(module.class_names)
+
+    def run(rgb: Image) -> Detections:
+        with torch.inference_mode():
+            found = detect(module.network, [torch.from_numpy(rgb).permute(2, 0, 1)])[0]
+        boxes, labels, scores, quality, masks = (
+            found[name].numpy() for name in ("boxes", "labels", "scores", "quality", "masks")
+        )
+        height, width = rgb.shape[:2]
+        return Detections(boxes, labels, scores, quality, masks, (height, width), names)
+
+    return run
+
+
+def frame_rates(runners: Mapping[str, Runner], pictures: Sequence[Image]) -> dict[str, Rate]:
+    """Frames per second of each runner, from uint8 [H, W, 3] to the masks of its likely detections.
+
+    The runners take turns on every picture, so that whatever else the machine does hits them all; the first picture is
+    run once before, unmeasured.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in runners}
+    for picture in (pictures[0], *pictures):
+        for name, run in runners.items():
+            start = time.perf_counter()
+            found = run(picture)
+            found.select(found.scores >= LIKELY).masks()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: _rate(taken[1:]) for name, taken in seconds.items()}
+
+
+def _rate(seconds: Sequence[float]) -> Rate:
+    low, median, high = np.percentile(seconds, [75, 50, 25])
+    return Rate(1 / float(median), 1 / float(low), 1 / float(high))
+
+
+def peak_memory(file: Path, picture: Path, threads: int) -> float:
+    """MiB that a process of its own takes at most, onnxruntime and numpy included, when it runs a file on a picture.
+
+    picture: a .npy file of uint8 [H, W, 3]. Raises CohdcError when the process fails.
+    """
+    command = [sys.executable, "-c", _PEAK, str(file), str(threads), str(picture)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise CohdcError(f"{file}: does not run by itself: {done.stderr.strip().splitlines()[-1]}")
+    kib = int(done.stdout)
+    return kib / 1024 if sys.platform != "darwin" else kib / 2**20
+
+
+def spread(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median, smallest and largest."""
+    return statistics.median(values), min(values), max(values)
+
+
+def runners_of(checkpoint: Path | None, files: Mapping[str, Path], threads: int) -> dict[str, Runner]:
+    """`fps_torch` of a checkpoint and one runner of each file, by the names of table4.json's columns."""
+    torch.set_num_threads(threads)
+    found: dict[str, Runner] = {} if checkpoint is None else {"fps_torch": torch_runner(checkpoint)}
+    return found | {name: Segmenter(path, threads) for name, path in files.items()}

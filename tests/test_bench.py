@@ -1,0 +1,209 @@
+"""Table 4: rows are cached, timed in turn, and written whole; a tiny bench runs from data to table."""
+
+import csv
+import json
+from pathlib import Path
+
+import coco_toys
+import numpy as np
+import pytest
+
+from cohdc_train.bench import _fit_options, bench
+from cohdc_train.bench import entries as entries_module
+from cohdc_train.bench.entries import ROWS, Entry
+from cohdc_train.bench.speed import frame_rates, spread
+from cohdc_train.bench.table import _row, as_text, plot
+from cohdc_train.bench.training import call, train
+from cohdc_train.errors import CohdcError
+from cohdc_train.segmenter import Detections
+
+KEYS = {
+    *("name", "train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "model_mb", "ap", "boundary_ap"),
+    *("s90_matched", "s90_all", "peak_mb"),
+}
+TINY = """
+data: {canvas: [48, 64]}
+model:
+  network: {width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16, proposals: [50, 20],
+            detections: 10}
+trainer: {accelerator: cpu, enable_model_summary: false}
+"""
+
+
+def nothing(rgb):
+    empty = np.zeros((0, 4), np.float32)
+    fields = (
+        np.zeros(0, np.int64),
+        np.zeros(0, np.float32),
+        np.zeros(0, np.float32),
+        np.zeros((0, 28, 28), np.float32),
+    )
+    return Detections(empty, *fields, rgb.shape[:2], ("person",))
+
+
+def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monkeypatch):
+    clock = [0.0]
+    order = []
+
+    def runner(name, seconds):
+        def run(rgb):
+            order.append((name, int(rgb[0, 0, 0])))
+            clock[0] += seconds * (100 if len(order) <= 2 else 1)
+            return nothing(rgb)
+
+        return run
+
+    monkeypatch.setattr("cohdc_train.bench.speed.time.perf_counter", lambda: clock[0])
+    pictures = [np.full((8, 8, 3), i, np.uint8) for i in range(3)]
+    rates = frame_rates({"slow": runner("slow", 0.5), "fast": runner("fast", 0.125)}, pictures)
+    assert order == [(name, i) for i in (0, 0, 1, 2) for name in ("slow", "fast")]
+    assert rates["slow"] == pytest.approx((2, 2, 2))
+    assert rates["fast"] == pytest.approx((8, 8, 8))
+
+
+def entry(tmp_path: Path, seed: int | None, ap: float) -> Entry:
+    files = {"fps_ort": tmp_path / "a.onnx"} | ({} if seed is None else {"fps_ort_int8": tmp_path / "b.onnx"})
+    for path in files.values():
+        path.write_bytes(b"0" * 2_500_000)
+    scores = {"ap": ap, "boundary_ap": 0.1, "s90_matched": float("nan"), "s90_all": 0.0, "vertices": 20.0}
+    seconds = None if seed is None else 60.0 + 10 * seed
+    return Entry("row", seed, None, files, seconds, scores if seed is None else scores | {"ap_int8": ap - 0.01})
+
+
+def test_a_row_holds_medians_over_seeds_ranges_and_null_where_there_is_nothing(tmp_path):
+    rates = {"fps_ort": (4.0, 3.0, 5.0), "fps_ort_int8": (8.0, 7.0, 9.0)}
+    row = _row("ours", [entry(tmp_path, s, ap) for s, ap in enumerate((0.3, 0.5, 0.4))], _rates(rates), 99.0)
+    assert set(row) >= KEYS
+    assert (row["ap"], row["ap_int8"], row["train_seconds"]) == pytest.approx((0.4, 0.39, 70.0))
+    assert row["ranges"]["ap"] == [0.3, 0.5]
+    assert row["s90_matched"] is None
+    assert row["fps_torch"] is None
+    assert row["model_mb"] == 2.5
+    foreign = _row("peer.onnx", [entry(tmp_path, None, 0.2)], _rates({"fps_ort": (4.0, 3.0, 5.0)}), 99.0)
+    assert foreign["train_seconds"] is foreign["fps_ort_int8"] is foreign["ap_int8"] is None
+    text = as_text([row, foreign], "a machine")
+    assert "0.400 (0.300-0.500)" in text
+    assert "4.00 (3.00-5.00)" in text
+    assert text.splitlines()[3].startswith("| peer.onnx | - | - | 4.00")
+    assert text.endswith("a machine\n")
+    assert plot([row, foreign]).startswith(b"\x89PNG")
+
+
+def _rates(values):
+    from cohdc_train.bench.speed import Rate
+
+    return {name: Rate(*rate) for name, rate in values.items()}
+
+
+def test_spread_is_median_and_range():
+    assert spread([3.0, 1.0, 10.0]) == (3.0, 1.0, 10.0)
+
+
+def test_the_budget_is_epochs_or_minutes():
+    assert _fit_options(Path("c.yaml"), ["--x=1"], 3, None) == ("--config=c.yaml", "--x=1", "--trainer.max_epochs=3")
+    assert "--trainer.max_time=00:01:30:30" in _fit_options(None, [], None, 90.5)
+    assert "--model.optimizer.final_fraction=1" in _fit_options(None, [], None, 1)
+    for epochs, minutes in ((None, None), (3, 2.0)):
+        with pytest.raises(CohdcError, match="a budget is needed"):
+            _fit_options(None, [], epochs, minutes)
+
+
+def test_unknown_rows_and_files_are_one_line(tmp_path):
+    with pytest.raises(CohdcError, match="no row 'VGG'; there are HDC-Net, ResNet50, ResNet101, MobileNetV1"):
+        bench(tmp_path, out=tmp_path / "o", rows=["VGG"], epochs=1)
+    with pytest.raises(CohdcError, match="no row 'VGG'"):
+        bench(tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"VGG": "x.pth"}, epochs=1)
+    with pytest.raises(CohdcError, match=r"absent\.onnx: no such file"):
+        bench(tmp_path, out=tmp_path / "o", rows=[], models=[tmp_path / "absent.onnx"], epochs=1)
+
+
+def test_a_training_is_done_once_and_again_when_its_options_change(tmp_path, monkeypatch):
+    calls = []
+
+    def fake(log, verb, *arguments, threads):
+        calls.append(arguments)
+        (tmp_path / "last.ckpt").write_bytes(b"weights")
+
+    monkeypatch.setattr("cohdc_train.bench.training.call", fake)
+    first = train(tmp_path, [Path("d")], ["--a=1"])
+    assert train(tmp_path, [Path("d")], ["--a=1"]) == first
+    assert len(calls) == 1
+    train(tmp_path, [Path("d")], ["--a=2"])
+    assert len(calls) == 2
+    (tmp_path / "last.ckpt").unlink()
+    train(tmp_path, [Path("d")], ["--a=2"])
+    assert len(calls) == 3
+
+
+def test_a_failed_step_names_its_log(tmp_path):
+    with pytest.raises(CohdcError, match=r"log\.txt: cohdc fit failed with"):
+        call(tmp_path / "log.txt", "fit", "--no.such.option=1")
+    assert "no.such.option" in (tmp_path / "log.txt").read_text()
+
+
+def test_an_interrupted_bench_goes_on_from_what_is_exported_and_scored(tmp_path, monkeypatch):
+    """Scores are kept with what they were made from: another file is scored anew."""
+    file = tmp_path / "model.onnx"
+    file.write_bytes(b"one")
+    runs = []
+
+    class Scored:
+        rows = ()
+        scores = dict.fromkeys(entries_module.SCORES.values(), 0.25)
+
+    monkeypatch.setattr(entries_module, "score_file", lambda *a, **k: runs.append(a) or Scored)
+    kept = tmp_path / "scores.json"
+    first = entries_module._scores({"fps_ort": file}, tmp_path, kept, 1)
+    assert first["ap"] == 0.25
+    assert np.isnan(first["vertices"])
+    entries_module._scores({"fps_ort": file}, tmp_path, kept, 1)
+    assert len(runs) == 1
+    file.write_bytes(b"two")
+    entries_module._scores({"fps_ort": file}, tmp_path, kept, 1)
+    assert len(runs) == 2
+
+
+def test_every_row_is_a_network(small_config):
+    """The rows' options are those of `cohdc fit`, and their networks differ as their names say."""
+    from jsonargparse import ArgumentParser
+
+    from cohdc_train.models import MaskRCNN, NetworkConfig
+
+    parser = ArgumentParser()
+    parser.add_class_arguments(NetworkConfig, "model.network")
+    sizes = {}
+    for name, options in ROWS.items():
+        given = parser.parse_args([*options, "--model.network.width=0.125", "--model.network.fpn_channels=8"])
+        network = MaskRCNN(1, NetworkConfig(**vars(given.model.network)))
+        sizes[name] = sum(p.numel() for p in network.backbone.body.parameters())
+        dilated = any(rate > 1 for stage in network.backbone.body.rates() for rate in stage)
+        assert dilated == (name == "HDC-Net")
+    assert sizes["HDC-Net"] == sizes["ResNet50"] < sizes["ResNet101"]
+    assert sizes["MobileNetV1"] < sizes["ResNet50"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
+    data = coco_toys.folder(tmp_path / "data")
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    asked = {"rows": ["ResNet50", "MobileNetV1"], "fit_config": tmp_path / "tiny.yaml", "epochs": 1, "images": 2}
+    table = bench(data, out=tmp_path / "out", **asked)
+    written = json.loads((tmp_path / "out" / "table4.json").read_text())
+    assert [row["name"] for row in written] == ["ResNet50", "MobileNetV1"]
+    for row in written:
+        assert set(row) >= KEYS
+        assert min(row[key] for key in ("train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "peak_mb")) > 0
+        assert row["model_mb_int8"] < row["model_mb"]
+        assert 0 <= row["ap"] <= 1
+    with (tmp_path / "out" / "table4.csv").open() as stream:
+        assert [row["network"] if "network" in row else row["name"] for row in csv.DictReader(stream)] == [
+            row["name"] for row in table
+        ]
+    assert (tmp_path / "out" / "table4.png").read_bytes().startswith(b"\x89PNG")
+    before = {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")}
+    ours = tmp_path / "out" / "ResNet50_seed0" / "model.onnx"
+    again = bench(data, out=tmp_path / "out", models=[ours], **asked)
+    assert {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")} == before
+    assert again[2]["ap"] == again[0]["ap"]
+    assert again[2]["fps_torch"] is None
