@@ -196,10 +196,9 @@ def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
         assert min(row[key] for key in ("train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "peak_mb")) > 0
         assert row["model_mb_int8"] < row["model_mb"]
         assert 0 <= row["ap"] <= 1
+        assert row["peak_mb"] < 400  # of a process without torch, not of this one
     with (tmp_path / "out" / "table4.csv").open() as stream:
-        assert [row["network"] if "network" in row else row["name"] for row in csv.DictReader(stream)] == [
-            row["name"] for row in table
-        ]
+        assert [row["name"] for row in csv.DictReader(stream)] == [row["name"] for row in table]
     assert (tmp_path / "out" / "table4.png").read_bytes().startswith(b"\x89PNG")
     before = {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")}
     ours = tmp_path / "out" / "ResNet50_seed0" / "model.onnx"

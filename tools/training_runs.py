@@ -4,15 +4,14 @@ Imported by the tools beside it; runs the checkout's `cohdc fit` and `cohdc vali
 """
 
 import json
-import os
 import statistics
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from cohdc_train.bench.training import call, train
+from cohdc_train.files import write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 Scores = dict[str, float]
@@ -40,32 +39,15 @@ class Run:
         asked = {"options": list(self.options), "scorings": {k: list(v) for k, v in self.scorings.items()}}
         if kept.is_file() and (known := json.loads(kept.read_text()))["asked"] == asked:
             return known["scores"]
-        self.folder.mkdir(parents=True, exist_ok=True)
-        start = time.monotonic()
-        roots = f"[{','.join(str(root) for root in self.data)}]"
-        self._call("fit", f"--data.root={roots}", f"--out={self.folder}", "--data.workers=0", *self.options)
-        seconds = time.monotonic() - start
+        checkpoint, seconds = train(self.folder, self.data, self.options)
         scores: dict[str, Scores] = {}
         for name, options in self.scorings.items():
             out = self.folder / f"scores_{name}.json"
-            last = str(self.folder / "last.ckpt")
-            self._call("validate", last, str(self.data[0]), f"--out={out}", "--workers=0", *options)
+            fixed = (str(checkpoint), str(self.data[0]), f"--out={out}", "--workers=0")
+            call(self.folder / "log.txt", "validate", *fixed, *options)
             scores[name] = json.loads(out.read_text()) | {"seconds": seconds}
-        temporary = kept.with_suffix(".part")
-        temporary.write_text(json.dumps({"asked": asked, "scores": scores}, indent=2))
-        temporary.replace(kept)
+        write_json(kept, {"asked": asked, "scores": scores})
         return scores
-
-    def _call(self, verb: str, *arguments: str) -> None:
-        """Run a verb on one thread; its output goes to log.txt. Exits naming the log when it fails."""
-        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-        log = self.folder / "log.txt"
-        with log.open("a") as stream:
-            command = [sys.executable, "-m", "cohdc_train", verb, *arguments]
-            print("+", *command, file=stream, flush=True)
-            done = subprocess.run(command, env=environment, stdout=stream, stderr=stream, check=False)
-        if done.returncode:
-            raise SystemExit(f"cohdc {verb} failed with {done.returncode}: see {log}")
 
 
 def run_all(runs: Sequence[Run], jobs: int) -> list[dict[str, Scores]]:
