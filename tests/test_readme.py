@@ -16,7 +16,7 @@ from cohdc_train.cli import VERBS, main
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-LIGHTNING = ("fit", "validate")  # Lightning parses these two by itself
+LIGHTNING = ("fit",)  # Lightning parses it by itself
 
 
 def commands(text: str) -> list[list[str]]:
