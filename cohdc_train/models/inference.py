@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cohdc_train.models.mask_rcnn import ROI_LEVELS, ROI_STRIDES, MaskRCNN
+from cohdc_train.models.mask_rcnn import MaskRCNN
 from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels, rows_to_segment
 
 _RPN_NMS_IOU = 0.7
@@ -71,7 +71,7 @@ def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> Padd
     pyramid = network.features(canvas)
     limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
     proposals = _propose(network, list(pyramid.values()), limit)
-    levels = [pyramid[name] for name in ROI_LEVELS]
+    levels = [pyramid[name] for name in network.config.roi_levels()]
     boxes, labels, scores, count = _classify(network, levels, proposals, limit)
     masks, quality = _segment(network, levels, boxes, labels, count)
     return PaddedDetections(boxes, labels, scores, quality, masks, count)
@@ -84,7 +84,7 @@ def _propose(network: MaskRCNN, features: list[Tensor], limit: Tensor) -> Tensor
     boxes, scores = [], []
     for level, (logits, delta) in enumerate(zip(objectness, deltas, strict=True)):
         score, index = _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
-        stride = 4 * 2**level
+        stride = network.config.finest_stride * 2**level
         anchors = _anchors(rpn.anchor_generator.cell_anchors[level].to(logits.device), index, logits.shape[3], stride)
         delta = _flatten(delta, 4).gather(1, index[:, :, None].expand(-1, -1, 4))
         box = _decode(delta.float(), anchors, (1.0, 1.0, 1.0, 1.0), limit)
@@ -104,7 +104,7 @@ def _classify(
     config, heads = network.config, network.roi_heads
     batch, rois = proposals.shape[:2]
     images = torch.arange(batch, device=proposals.device).repeat_interleave(rois)
-    pooled = roi_pool_levels(levels, proposals.reshape(batch * rois, 4), images, ROI_STRIDES, 7)
+    pooled = roi_pool_levels(levels, proposals.reshape(batch * rois, 4), images, config.roi_strides(), 7)
     logits, deltas = heads.box_predictor(heads.box_head(pooled))
     classes = network.num_classes
     scores = logits.float().softmax(dim=1)[:, 1:].reshape(batch, rois * classes)
@@ -132,7 +132,7 @@ def _segment(
     present = torch.arange(n, device=count.device)[None] < count[:, None]
     rows = rows_to_segment(present.reshape(batch * n))
     label = labels.reshape(batch * n)[rows]
-    pooled = roi_pool_levels(levels, boxes.reshape(batch * n, 4)[rows], rows // n, ROI_STRIDES, 14)
+    pooled = roi_pool_levels(levels, boxes.reshape(batch * n, 4)[rows], rows // n, network.config.roi_strides(), 14)
     logits = heads.mask_predictor(heads.mask_head(pooled))
     side = logits.shape[-1]
     masks = logits.gather(1, (label + 1)[:, None, None, None].expand(-1, 1, side, side))[:, 0].sigmoid()

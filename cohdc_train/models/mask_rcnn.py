@@ -20,14 +20,14 @@ from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss
 from cohdc_train.models.cqe_targets import Goal, band_of, cqe_targets
 from cohdc_train.models.mask_head import MaskSize, mask_loss, mask_predictor
-from cohdc_train.models.mobilenet import MobileNetV1
+from cohdc_train.models.mobilenet_v1 import MobileNetV1
+from cohdc_train.models.mobilenet_v2 import MobileNetV2
 from cohdc_train.models.resnet import Depth, HDCResNet
 from cohdc_train.models.rpn import build_rpn, in_crowd
 from cohdc_train.models.true_masks import TrueMasks
 
 Target = dict[str, Any]
-ROI_LEVELS = ("0", "1", "2", "3")
-ROI_STRIDES = [4, 8, 16, 32]
+STRIDES = (4, 8, 16, 32)  # of the backbone's four stages
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..1
 
 
@@ -36,7 +36,7 @@ class NetworkConfig:
     """Everything that shapes the network; the number of classes comes from the data.
 
     Attributes:
-        backbone: "resnet", or "mobilenet_v1", which has one depth.
+        backbone: "resnet", "mobilenet_v1" or "mobilenet_v2"; only the first has depths.
         depth: ResNet of 18, 34, 50 or 101 layers.
         width: channels of the backbone as a share of ResNet's.
         rates: dilation patterns of the four stages.
@@ -44,7 +44,8 @@ class NetworkConfig:
         norm: "batch" trains BatchNorm, in the pyramid too; "frozen" keeps the weights' statistics.
         frozen_stages: how many of the stem and the four stages are not trained.
         canvas: (height, width) in px every image is fitted into.
-        anchor_scales: side of the anchors in px, one per pyramid level from stride 4; a fifth adds the pool level.
+        finest_stride: of the pyramid: 4, or 8 without the level that costs most and sees the smallest objects.
+        anchor_scales: side of the anchors in px, one per pyramid level from the finest; one more adds the pool level.
         fpn_channels: width of the pyramid, and of the RPN and mask heads.
         fc: width of the box and CQE heads' fully connected layers.
         cqe: how the CQE head joins feature and mask ("concat", "multiply", "add"); "off" leaves the head out, and
@@ -59,7 +60,7 @@ class NetworkConfig:
         nms_iou: overlap from which the weaker of two detections of a class is dropped.
     """
 
-    backbone: Literal["resnet", "mobilenet_v1"] = "resnet"
+    backbone: Literal["resnet", "mobilenet_v1", "mobilenet_v2"] = "resnet"
     depth: Depth = 50
     width: float = 1.0
     rates: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3))
@@ -67,6 +68,7 @@ class NetworkConfig:
     norm: Literal["batch", "frozen"] = "batch"
     frozen_stages: int = 0
     canvas: tuple[int, int] = (800, 1024)
+    finest_stride: Literal[4, 8] = 4
     anchor_scales: tuple[int, ...] = (32, 64, 128, 256)
     fpn_channels: int = 256
     fc: int = 1024
@@ -80,12 +82,21 @@ class NetworkConfig:
     nms_iou: float = 0.5
 
     def __post_init__(self) -> None:
-        if len(self.anchor_scales) not in (4, 5):
-            raise ValueError(f"anchor_scales {self.anchor_scales}: {len(self.anchor_scales)} scales for 4 or 5 levels")
+        levels, scales = len(self.roi_strides()), len(self.anchor_scales)
+        if scales not in (levels, levels + 1):
+            raise ValueError(f"anchor_scales {self.anchor_scales}: {scales} scales for {levels} or {levels + 1} levels")
         if not 0 <= self.frozen_stages <= 5:
             raise ValueError(f"frozen_stages {self.frozen_stages}: a ResNet has a stem and 4 stages")
         if self.weights is not None and self.width != 1.0:
             raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
+
+    def roi_strides(self) -> list[int]:
+        """Strides of the pyramid's levels, without the pool level."""
+        return [stride for stride in STRIDES if stride >= self.finest_stride]
+
+    def roi_levels(self) -> list[str]:
+        """Names of those levels."""
+        return [str(STRIDES.index(stride)) for stride in self.roi_strides()]
 
 
 class Backbone(nn.Module):
@@ -94,16 +105,22 @@ class Backbone(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         shape = (config.width, config.rates, config.norm, config.frozen_stages)
-        self.body = HDCResNet(config.depth, *shape) if config.backbone == "resnet" else MobileNetV1(*shape)
+        self.body: HDCResNet | MobileNetV1 | MobileNetV2
+        if config.backbone == "resnet":
+            self.body = HDCResNet(config.depth, *shape)
+        else:
+            self.body = (MobileNetV1 if config.backbone == "mobilenet_v1" else MobileNetV2)(*shape)
+        self.levels = config.roi_levels()
         if config.weights is not None:
             self.body.load(config.weights)
-        pool = LastLevelMaxPool() if len(config.anchor_scales) == 5 else None
+        pool = LastLevelMaxPool() if len(config.anchor_scales) > len(self.levels) else None
         norm = nn.BatchNorm2d if config.norm == "batch" else None
-        self.fpn = FeaturePyramidNetwork(self.body.out_channels, config.fpn_channels, pool, norm)
+        self.fpn = FeaturePyramidNetwork(self.body.out_channels[-len(self.levels) :], config.fpn_channels, pool, norm)
 
     def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
-        """x: [B, 3, H, W] normalised. Returns the pyramid, "0" at stride 4 to "3" at 32, perhaps "pool" at 64."""
-        features: OrderedDict[str, Tensor] = self.fpn(self.body(x))
+        """x: [B, 3, H, W] normalised. Returns the pyramid: "0" at stride 4 to "3" at 32, perhaps "pool" at 64."""
+        stages = self.body(x)
+        features: OrderedDict[str, Tensor] = self.fpn(OrderedDict((name, stages[name]) for name in self.levels))
         return features
 
 
@@ -226,7 +243,7 @@ class MaskRCNN(nn.Module):
 def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:
     channels = config.fpn_channels
     return RoIHeads(
-        box_roi_pool=MultiScaleRoIAlign(list(ROI_LEVELS), 7, 2),
+        box_roi_pool=MultiScaleRoIAlign(config.roi_levels(), 7, 2),
         box_head=TwoMLPHead(channels * 49, config.fc),
         box_predictor=FastRCNNPredictor(config.fc, num_classes + 1),
         fg_iou_thresh=0.5,
@@ -237,7 +254,7 @@ def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:
         score_thresh=config.score_threshold,
         nms_thresh=config.nms_iou,
         detections_per_img=config.detections,
-        mask_roi_pool=MultiScaleRoIAlign(list(ROI_LEVELS), 14, 2),
+        mask_roi_pool=MultiScaleRoIAlign(config.roi_levels(), 14, 2),
         mask_head=MaskRCNNHeads(channels, (channels,) * 4, 1),
         mask_predictor=mask_predictor(channels, num_classes + 1, config.mask_size),
     )

@@ -1,11 +1,9 @@
 """ResNets with hybrid dilated stages, parameter for parameter torchvision's (paper 2.1.1, Fig. 4)."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Literal
 
 from torch import Tensor, nn
-from torchvision.models import get_model_weights
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
 from cohdc_train.models.staged import FrozenNorm, Rates, StagedBackbone, load_weights, read_weights
@@ -78,16 +76,7 @@ class HDCResNet(StagedBackbone):
         Raises ValueError naming the file and the first tensor that does not fit; FileNotFoundError when there is no
         such file and no such name.
         """
-        published = get_model_weights(f"resnet{self.depth}")
-        if Path(weights).is_file():
-            state = read_weights(weights)
-        elif weights in published.__members__:
-            state = published[weights].get_state_dict(progress=True)
-        else:
-            names = ", ".join(published.__members__)
-            raise FileNotFoundError(
-                f"{weights}: no such file, and torchvision's ResNet-{self.depth} weights are {names}"
-            )
+        state = read_weights(weights, f"resnet{self.depth}")
         load_weights(self, weights, state, f"ResNet-{self.depth}")
 
 

@@ -2,11 +2,13 @@
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Self
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
+from torchvision.models import get_model_weights
 from torchvision.ops import FrozenBatchNorm2d
 
 from cohdc_train.models.hdc import cycle
@@ -125,10 +127,20 @@ def load_weights(backbone: StagedBackbone, source: str, state: dict[str, Tensor]
     backbone.load_state_dict({key: value for key, value in state.items() if key in own}, strict=False)
 
 
-def read_weights(path: str) -> dict[str, Tensor]:
-    """A state dict that `torch.save` wrote."""
-    state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
-    return state
+def read_weights(weights: str, model: str | None) -> dict[str, Tensor]:
+    """A state dict: a file that `torch.save` wrote, or torchvision's weights of that name for its model.
+
+    Raises FileNotFoundError when there is no such file and no such name; model is None where nothing is published.
+    """
+    if Path(weights).is_file():
+        stored: dict[str, Tensor] = torch.load(weights, map_location="cpu", weights_only=True)
+        return stored
+    published = {} if model is None else get_model_weights(model).__members__
+    if weights in published:
+        fetched: dict[str, Tensor] = published[weights].get_state_dict(progress=True)
+        return fetched
+    names = f"torchvision's {model} weights are {', '.join(published)}" if model else "torchvision publishes none"
+    raise FileNotFoundError(f"{weights}: no such file, and {names}")
 
 
 def _convolutions(stage: Sequence[nn.Module]) -> list[nn.Conv2d]:

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from torchvision.models import resnet18, resnet50
+from torchvision.models import mobilenet_v2, resnet18, resnet50
 from torchvision.models.feature_extraction import create_feature_extractor
 from torchvision.ops import FrozenBatchNorm2d
 
-from cohdc_train.models.mobilenet import MobileNetV1
+from cohdc_train.models.mobilenet_v1 import MobileNetV1
+from cohdc_train.models.mobilenet_v2 import MobileNetV2
 from cohdc_train.models.resnet import HDCResNet
 from cohdc_train.models.staged import FrozenNorm
 
@@ -84,6 +85,35 @@ def test_mobilenets_strides_channels_and_pattern():
     assert not any(p.requires_grad for p in backbone.stem_block.parameters())
 
 
+def test_mobilenet_v2_computes_what_torchvisions_computes(tmp_path):
+    torch.manual_seed(0)
+    reference = mobilenet_v2(weights=None).eval()
+    torch.save(reference.state_dict(), tmp_path / "v2.pth")
+    backbone = MobileNetV2().eval()
+    backbone.load(str(tmp_path / "v2.pth"))
+    image = torch.rand(1, 3, 64, 96)
+    names = {"features.3": "0", "features.6": "1", "features.13": "2", "features.17": "3"}
+    stages = create_feature_extractor(reference, names)(image)
+    features = backbone(image)
+    assert [f.shape[1] for f in features.values()] == backbone.out_channels == [24, 32, 96, 320]
+    for name in "0123":
+        torch.testing.assert_close(features[name], stages[name])
+    with pytest.raises(FileNotFoundError, match="IMAGENET1K_V2"):
+        backbone.load("nothing")
+
+
+@pytest.mark.parametrize("rates", [((1,),) * 4, ((1,), (1,), (1, 2), (1, 2, 3))])
+def test_mobilenet_v2_keeps_strides_and_its_receptive_field_is_what_a_gradient_reaches(rates):
+    body = MobileNetV2(width=0.25, rates=rates).eval()
+    image = torch.rand(1, 3, 1536, 32, requires_grad=True)
+    features = body(image)
+    assert [f.shape[2] for f in features.values()] == [384, 192, 96, 48]
+    features["3"][0, :, 24, 0].sum().backward()
+    rows = image.grad.abs().sum(dim=(0, 1, 3)).nonzero()[:, 0]
+    side = body.receptive_field()
+    assert side - 4 <= int(rows.max() - rows.min()) + 1 <= side
+
+
 def test_mobilenets_receptive_field_is_what_a_gradient_reaches():
     body = MobileNetV1(width=0.25).eval()
     image = torch.rand(1, 3, 1024, 64, requires_grad=True)
@@ -113,7 +143,7 @@ def test_mobilenets_weights_load_by_path_only(tmp_path):
     target = MobileNetV1(norm="frozen")
     target.load(str(tmp_path / "m.pth"))
     assert torch.equal(target.blocks[12].pw.conv.weight, source.blocks[12].pw.conv.weight)
-    with pytest.raises(FileNotFoundError, match="torchvision publishes no MobileNetV1 weights"):
+    with pytest.raises(FileNotFoundError, match="torchvision publishes none"):
         MobileNetV1().load("IMAGENET1K_V1")
     torch.save({"fc.weight": torch.zeros(1)}, tmp_path / "empty.pth")
     with pytest.raises(ValueError, match=r"empty\.pth: no tensor .* these are not MobileNetV1 weights"):

@@ -60,6 +60,29 @@ def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
     assert torch.equal(found["labels"] + 1, expected["labels"])
 
 
+@pytest.mark.parametrize("backbone", ["mobilenet_v1", "mobilenet_v2"])
+def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector_finds(backbone, small_config):
+    torch.manual_seed(0)
+    changed = {"backbone": backbone, "rates": ((1,),) * 4, "finest_stride": 8, "anchor_scales": (32, 64, 128)} | {
+        "score_threshold": 0.1
+    }
+    network = MaskRCNN(2, dataclasses.replace(small_config, **changed))
+    losses = network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])])
+    sum(losses.values()).backward()
+    assert all(torch.isfinite(loss) for loss in losses.values())
+    network.eval()
+    with torch.no_grad():
+        network.rpn.head.cls_logits.weight.mul_(3)
+        network.rpn.head.bbox_pred.weight.mul_(10)
+    image = (torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0] * 255).to(torch.uint8)
+    with torch.inference_mode():
+        expected = _torchvisions(network)([image / 255])[0]
+        found = detect(network, [image])[0]
+    assert len(found["scores"]) >= 3
+    torch.testing.assert_close(found["boxes"], expected["boxes"], atol=1e-3, rtol=0)
+    torch.testing.assert_close(found["scores"], expected["scores"], atol=1e-5, rtol=0)
+
+
 def test_anchors_equal_torchvisions(opinionated):
     generator = opinionated.rpn.anchor_generator
     grids = [(24, 32), (12, 16), (6, 8), (3, 4)]
@@ -200,6 +223,7 @@ def test_cqe_can_be_left_out(small_config):
     ("change", "message"),
     [
         ({"anchor_scales": (8, 16, 32)}, "3 scales for 4 or 5 levels"),
+        ({"finest_stride": 8, "anchor_scales": (8, 16, 32, 64, 128)}, "5 scales for 3 or 4 levels"),
         ({"frozen_stages": 6}, "frozen_stages 6"),
         ({"weights": "IMAGENET1K_V1", "width": 0.5}, "full width"),
     ],

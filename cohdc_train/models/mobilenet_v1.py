@@ -1,7 +1,6 @@
 """MobileNetV1 as a backbone (Howard et al. 2017), the light row of the paper's Table 4."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Literal
 
 import torch.nn.functional as F  # noqa: N812
@@ -95,9 +94,7 @@ class MobileNetV1(StagedBackbone):
         """Fill a full-width network from a state dict. Raises ValueError as `load_weights`; FileNotFoundError when
         there is no such file: torchvision publishes none under a name.
         """
-        if not Path(weights).is_file():
-            raise FileNotFoundError(f"{weights}: no such file, and torchvision publishes no MobileNetV1 weights")
-        state = {key.replace("stem.", "stem_block."): value for key, value in read_weights(weights).items()}
+        state = {key.replace("stem.", "stem_block."): value for key, value in read_weights(weights, None).items()}
         load_weights(self, weights, state, "MobileNetV1")
 
 
