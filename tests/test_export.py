@@ -137,6 +137,23 @@ def test_every_form_of_mask_and_quality_head_exports(cqe, side, opinionated, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("backbone", ["mobilenet_v1", "mobilenet_v2"])
+def test_a_pyramid_from_stride_8_on_a_light_backbone_exports(backbone, small_config, tmp_path):
+    torch.manual_seed(0)
+    changed = {"backbone": backbone, "finest_stride": 8, "anchor_scales": (32, 64, 128), "score_threshold": 0.1}
+    config = dataclasses.replace(small_config, rates=((1,),) * 4, **changed)
+    module = MaskRCNNModule(["person", "car"], config)
+    with torch.no_grad():
+        pictures = [torch.from_numpy(cv2.resize(p, (128, 96))).permute(2, 0, 1) / 255 for p in drawn_images(4)]
+        for _ in range(30):  # without statistics of pictures, a deep random network is nearly constant
+            module.network.train().features(torch.stack(pictures))
+        module.network.eval().rpn.head.bbox_pred.weight.mul_(10)
+        module.network.rpn.head.cls_logits.weight.mul_(3)
+    torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / "light.ckpt")
+    assert _report(export(tmp_path / "light.ckpt"))["detections_compared"] > 20
+
+
+@pytest.mark.slow
 def test_a_hundred_detections_in_one_image(opinionated, tmp_path):
     config = dataclasses.replace(
         opinionated.config, detections=100, proposals=(400, 300), nms_iou=0.8, score_threshold=0.3
