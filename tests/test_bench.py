@@ -53,7 +53,7 @@ def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monke
 
         return run
 
-    monkeypatch.setattr("cohdc_train.bench.speed.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("cohdc_train.export.timing.time.perf_counter", lambda: clock[0])
     pictures = [np.full((8, 8, 3), i, np.uint8) for i in range(3)]
     rates = frame_rates({"slow": runner("slow", 0.5), "fast": runner("fast", 0.125)}, pictures)
     assert order == [(name, i) for i in (0, 0, 1, 2) for name in ("slow", "fast")]

@@ -1,6 +1,5 @@
 """What stands in a row of Table 4: a trained network or a finished model, exported and scored once."""
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from cohdc_train.contour import simplify, trace, vertices
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.export import export
-from cohdc_train.files import write_json
+from cohdc_train.files import sha256, write_json
 from cohdc_train.train.metrics import Results
 from cohdc_train.validate import score_file
 
@@ -63,9 +62,7 @@ def trained_entry(
     threads: int,
     int8: bool,
 ) -> Entry:
-    """Train a row with a seed in a folder, or take what lies there. Raises CohdcError when there is no such row."""
-    if name not in ROWS:
-        raise CohdcError(f"no row {name!r}; there are {', '.join(ROWS)}")
+    """Train a row with a seed in a folder, or take what lies there."""
     start = () if weights is None else (f"--model.network.weights={weights}",)
     trained = train(folder, [data.resolve()], (*options, *ROWS[name], *start, f"--seed_everything={seed}"), threads)
     return _exported(name, seed, trained, data, folder, threads, int8)
@@ -87,7 +84,7 @@ def _exported(
 ) -> Entry:
     file = folder / "model.onnx"
     small = file.with_name("model.int8.onnx")
-    digest, kept = _sha256(trained.checkpoint), folder / "exported.json"
+    digest, kept = sha256(trained.checkpoint), folder / "exported.json"
     if not (kept.is_file() and json.loads(kept.read_text()) == {"checkpoint": digest, "int8": int8}):
         images = CocoDataModule(data).folder.train[0].images[0].path.parent
         export(trained.checkpoint, file, int8=images if int8 else None, allow_drop=True)
@@ -100,7 +97,7 @@ def _exported(
 
 def _scores(files: Mapping[str, Path], data: Path, kept: Path, threads: int) -> dict[str, float]:
     """Scores of the files, kept with what they were made from."""
-    made_from = {name: _sha256(path) for name, path in files.items()} | {"data": str(data.resolve())}
+    made_from = {name: sha256(path) for name, path in files.items()} | {"data": str(data.resolve())}
     if kept.is_file():
         known = json.loads(kept.read_text())
         if known["made_from"] == made_from:
@@ -120,8 +117,3 @@ def mean_vertices(results: Results) -> float:
     masks = [rle.decode(row["segmentation"]).astype(np.bool_) for row in results.rows if row["score"] >= LIKELY]
     counts = [vertices(simplify(trace(mask), _IOU_FLOOR, "bas_dp")) for mask in masks if mask.any()]
     return float(np.mean(counts)) if counts else float("nan")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -3,21 +3,19 @@
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from cohdc_train.errors import CohdcError
+from cohdc_train.export.timing import Image, K, seconds_in_turn
 from cohdc_train.models import detect
 from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.train.module import MaskRCNNModule
 
-Image = NDArray[np.uint8]
 Runner = Callable[[Image], Detections]
 
 LIKELY = 0.5  # score from which a detection's mask is pasted
@@ -63,20 +61,18 @@ def torch_runner(checkpoint: Path) -> Runner:
     return run
 
 
-def frame_rates(runners: Mapping[str, Runner], pictures: Sequence[Image]) -> dict[str, Rate]:
-    """Frames per second of each runner, from uint8 [H, W, 3] to the masks of its likely detections.
+def frame_rates(runners: Mapping[K, Runner], pictures: Sequence[Image]) -> dict[K, Rate]:
+    """Frames per second of each runner, in turn, from uint8 [H, W, 3] to the masks of its likely detections."""
+    whole = {name: _to_masks(run) for name, run in runners.items()}
+    return {name: _rate(taken) for name, taken in seconds_in_turn(whole, pictures).items()}
 
-    The runners take turns on every picture, so that whatever else the machine does hits them all; the first picture is
-    run once before, unmeasured.
-    """
-    seconds: dict[str, list[float]] = {name: [] for name in runners}
-    for picture in (pictures[0], *pictures):
-        for name, run in runners.items():
-            start = time.perf_counter()
-            found = run(picture)
-            found.select(found.scores >= LIKELY).masks()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: _rate(taken[1:]) for name, taken in seconds.items()}
+
+def _to_masks(run: Runner) -> Callable[[Image], None]:
+    def whole(rgb: Image) -> None:
+        found = run(rgb)
+        found.select(found.scores >= LIKELY).masks()
+
+    return whole
 
 
 def _rate(seconds: Sequence[float]) -> Rate:

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import math
 import os
 import platform
@@ -91,11 +90,9 @@ def _timed(entries: dict[str, Entry], pictures: Sequence[Any], threads: int) -> 
         for name, entry in entries.items()
         for column, runner in runners_of(entry.checkpoint, entry.files, threads).items()
     }
-    keys = {f"{name}\n{column}": (name, column) for name, column in runners}
-    taken = frame_rates({key: runners[pair] for key, pair in keys.items()}, pictures)
     rates: dict[str, dict[str, Rate]] = {name: {} for name in entries}
-    for key, (name, column) in keys.items():
-        rates[name][column] = taken[key]
+    for (name, column), rate in frame_rates(runners, pictures).items():
+        rates[name][column] = rate
     return rates
 
 
@@ -165,7 +162,7 @@ def _write(out: Path, table: Sequence[Row], said: str) -> None:
     writer = csv.DictWriter(stream, list(_COLUMNS), extrasaction="ignore")
     writer.writeheader()
     writer.writerows(table)
-    write_json(out / "table4.json", json.loads(json.dumps(list(table))))
+    write_json(out / "table4.json", list(table))
     write_text(out / "table4.csv", stream.getvalue())
     write_text(out / "table4.txt", text)
     write_bytes(out / "table4.png", plot(table))

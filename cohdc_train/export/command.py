@@ -1,8 +1,8 @@
 """The steps of `cohdc export`: write, prove, name; then the same for int8."""
 
-import hashlib
 import json
 import os
+import statistics
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,12 +11,13 @@ from typing import Any
 
 from cohdc_train import __version__, signature
 from cohdc_train.errors import CohdcError, ExportError
-from cohdc_train.export.accuracy import SCORES, Scorer, seconds_per_image
+from cohdc_train.export.accuracy import SCORES, Scorer
 from cohdc_train.export.graph import OPSET, count_flops, write_graph
 from cohdc_train.export.parity import TOLERANCES, compare
 from cohdc_train.export.pictures import Image, drawn_images, read_images
 from cohdc_train.export.quantization import CALIBRATION_IMAGES, quantize
-from cohdc_train.files import write_json
+from cohdc_train.export.timing import seconds_in_turn
+from cohdc_train.files import sha256, write_json
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule
 
@@ -43,7 +44,7 @@ def run(
     target = out if out is not None else checkpoint.parent / "model.onnx"
     if verify_only and not target.is_file():
         raise CohdcError(f"{target}: no such file")
-    module = MaskRCNNModule.load(checkpoint, _canvas_of(target) if verify_only else canvas)
+    module = MaskRCNNModule.load(checkpoint, Segmenter(target).canvas if verify_only else canvas)
     pictures = list(read_images(images, _PARITY_IMAGES)) if images is not None else drawn_images(_PARITY_IMAGES)
     scorer = Scorer(module, data, checkpoint) if data is not None else None
     if verify_only:
@@ -87,9 +88,12 @@ def _write_int8(
         operators = quantize(target, temporary, read_images(calibration, CALIBRATION_IMAGES))
         facts = {key: report[key] for key in ("checkpoint", "checkpoint_sha256", "opset", "contract", "classes")}
         facts |= {"file": name.name, "bytes": temporary.stat().st_size, "quantised_operators": operators}
-        seconds = seconds_per_image([target, temporary], list(read_images(calibration, 8)))
-        facts["seconds_per_image"] = dict(zip(("float32", "int8"), seconds, strict=True))
-        said = f"{name}: {facts['bytes'] / 1e6:.1f} MB, {seconds[1] / seconds[0]:.2f} of float32's time on one thread"
+        runners = {"float32": Segmenter(target, threads=1), "int8": Segmenter(temporary, threads=1)}
+        taken = seconds_in_turn(runners, list(read_images(calibration, 8)))
+        seconds = {kind: statistics.median(times) for kind, times in taken.items()}
+        facts["seconds_per_image"] = seconds
+        share = seconds["int8"] / seconds["float32"]
+        said = f"{name}: {facts['bytes'] / 1e6:.1f} MB, {share:.2f} of float32's time on one thread"
         if scorer is not None:
             scores = {"float32": report["scores"]["onnx"], "int8": scorer.file(temporary)}
             facts["scores"] = scores
@@ -108,7 +112,7 @@ def _facts(module: MaskRCNNModule, target: Path, file: Path, checkpoint: Path) -
     return {
         "file": target.name,
         "checkpoint": os.path.relpath(checkpoint, target.parent),
-        "checkpoint_sha256": _sha256(checkpoint),
+        "checkpoint_sha256": sha256(checkpoint),
         "bytes": file.stat().st_size,
         "gflops_image": round(cost.image, 3),
         "gflops_per_detection": round(cost.detection, 4),
@@ -148,20 +152,9 @@ def _checkpoint_of(file: Path) -> Path:
         raise CohdcError(f"{path}: names no checkpoint; cohdc export CHECKPOINT --out {file} --verify-only") from error
     if not checkpoint.is_file():
         raise CohdcError(f"{path}: its checkpoint {checkpoint} is gone")
-    if _sha256(checkpoint) != digest:
+    if sha256(checkpoint) != digest:
         raise CohdcError(f"{path}: {checkpoint} has changed since the export")
     return checkpoint
-
-
-def _canvas_of(file: Path) -> tuple[int, int] | None:
-    return Segmenter(file).canvas
-
-
-def _sha256(path: Path) -> str:
-    if not path.is_file():
-        raise CohdcError(f"{path}: no such file")
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _report_path(file: Path) -> Path:

@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from cohdc_train import signature
 from cohdc_train.errors import ExportError
 from cohdc_train.masks import paste_roi_mask
 from cohdc_train.models import Detector, MaskRCNN
+from cohdc_train.segmenter.session import open_session
 
 Image = NDArray[np.uint8]
 
@@ -69,9 +69,7 @@ def compare(network: MaskRCNN, path: Path, pictures: Sequence[Image]) -> Parity:
     """Run file and network on batches of 1, 2 and 4 at three sizes, on a black image, and on a mosaic of the pictures,
     which holds as many objects as can be had.
     """
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    session = open_session(path)
     detector = Detector(network).eval()
     parity = Parity()
     for batch in _batches(network.config.canvas, pictures):

@@ -24,11 +24,11 @@ from cohdc_train.models.mobilenet_v1 import MobileNetV1
 from cohdc_train.models.mobilenet_v2 import MobileNetV2
 from cohdc_train.models.resnet import Depth, HDCResNet
 from cohdc_train.models.rpn import build_rpn, in_crowd
+from cohdc_train.models.staged import MEAN, STD, Norm
 from cohdc_train.models.true_masks import TrueMasks
 
 Target = dict[str, Any]
 STRIDES = (4, 8, 16, 32)  # of the backbone's four stages
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..1
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class NetworkConfig:
     width: float = 1.0
     rates: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3))
     weights: str | None = None
-    norm: Literal["batch", "frozen"] = "batch"
+    norm: Norm = "batch"
     frozen_stages: int = 0
     canvas: tuple[int, int] = (800, 1024)
     finest_stride: Literal[4, 8] = 4

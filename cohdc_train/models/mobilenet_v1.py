@@ -1,17 +1,26 @@
 """MobileNetV1 as a backbone (Howard et al. 2017), the light row of the paper's Table 4."""
 
 from collections.abc import Callable
-from typing import Literal
 
+import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from cohdc_train.models.staged import FrozenNorm, Rates, StagedBackbone, load_weights, read_weights
+from cohdc_train.models.staged import (
+    MEAN,
+    STD,
+    Norm,
+    Rates,
+    StagedBackbone,
+    load_weights,
+    norm_layer,
+    read_weights,
+    rounded,
+)
 
 _EPS = 1e-3  # TensorFlow's, with which the published weights were trained
 _BLOCKS = ((64, 1), (128, 2), (128, 1), (256, 2), (256, 1), (512, 2), *((512, 1),) * 5, (1024, 2), (1024, 1))
 _STAGES = ((0, 3), (3, 5), (5, 11), (11, 13))  # blocks of each stage: strides 4, 8, 16, 32
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class _ConvNorm(nn.Module):
@@ -58,33 +67,34 @@ class MobileNetV1(StagedBackbone):
         ValueError: as `StagedBackbone.finish`.
     """
 
+    scale: Tensor
+    shift: Tensor
+
     def __init__(
         self,
         width: float = 1.0,
         rates: Rates = ((1,),) * 4,
-        norm: Literal["batch", "frozen"] = "batch",
+        norm: Norm = "batch",
         frozen_stages: int = 0,
     ) -> None:
         super().__init__()
-
-        def norm_layer(channels: int) -> nn.Module:
-            return nn.BatchNorm2d(channels, eps=_EPS) if norm == "batch" else FrozenNorm(channels, eps=_EPS)
-
-        channels = _rounded(32 * width)
-        self.stem_block = _ConvNorm(nn.Conv2d(3, channels, 3, 2, bias=False), norm_layer(channels))
+        make_norm = norm_layer(norm, _EPS)
+        channels = rounded(32 * width)
+        self.stem_block = _ConvNorm(nn.Conv2d(3, channels, 3, 2, bias=False), make_norm(channels))
         self.blocks = nn.ModuleList()
         for out, stride in _BLOCKS:
-            self.blocks.append(_Separable(channels, _rounded(out * width), stride, norm_layer))
-            channels = _rounded(out * width)
-        self.out_channels = [_rounded(_BLOCKS[end - 1][0] * width) for _, end in _STAGES]
+            self.blocks.append(_Separable(channels, rounded(out * width), stride, make_norm))
+            channels = rounded(out * width)
+        self.out_channels = [rounded(_BLOCKS[end - 1][0] * width) for _, end in _STAGES]
+        self.register_buffer("scale", 2 * torch.tensor(STD).view(3, 1, 1), persistent=False)
+        self.register_buffer("shift", 2 * torch.tensor(MEAN).view(3, 1, 1) - 1, persistent=False)
         self.finish(rates, frozen_stages)
 
     def parts(self) -> list[list[nn.Module]]:
         return [[self.stem_block], *([*self.blocks[start:end]] for start, end in _STAGES)]
 
     def stem(self, x: Tensor) -> Tensor:
-        mean, std = (x.new_tensor(v).view(3, 1, 1) for v in (_MEAN, _STD))
-        out: Tensor = self.stem_block(x * (2 * std) + (2 * mean - 1))
+        out: Tensor = self.stem_block(x * self.scale + self.shift)
         return out
 
     def field_of_stem(self) -> tuple[int, int]:
@@ -96,7 +106,3 @@ class MobileNetV1(StagedBackbone):
         """
         state = {key.replace("stem.", "stem_block."): value for key, value in read_weights(weights, None).items()}
         load_weights(self, weights, state, "MobileNetV1")
-
-
-def _rounded(channels: float) -> int:
-    return max(8, round(channels / 8) * 8)

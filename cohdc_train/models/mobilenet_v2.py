@@ -1,12 +1,9 @@
 """torchvision's MobileNetV2 as a backbone (Sandler et al. 2018), tensor for tensor."""
 
-from collections.abc import Callable
-from typing import Literal
-
 from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
-from cohdc_train.models.staged import FrozenNorm, Rates, StagedBackbone, load_weights, read_weights
+from cohdc_train.models.staged import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights
 
 _PARTS = ((0, 2), (2, 4), (4, 7), (7, 14), (14, 18))  # modules of the stem and the stages of strides 4, 8, 16, 32
 
@@ -28,12 +25,11 @@ class MobileNetV2(StagedBackbone):
         self,
         width: float = 1.0,
         rates: Rates = ((1,),) * 4,
-        norm: Literal["batch", "frozen"] = "batch",
+        norm: Norm = "batch",
         frozen_stages: int = 0,
     ) -> None:
         super().__init__()
-        norm_layer: Callable[..., nn.Module] = nn.BatchNorm2d if norm == "batch" else FrozenNorm
-        whole = mobilenet_v2(width_mult=width, norm_layer=norm_layer)
+        whole = mobilenet_v2(width_mult=width, norm_layer=norm_layer(norm))
         self.features = whole.features[: _PARTS[-1][1]]
         self.out_channels = [self.features[end - 1].out_channels for _, end in _PARTS[1:]]
         self.finish(rates, frozen_stages)

@@ -6,7 +6,7 @@ from typing import Literal
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
-from cohdc_train.models.staged import FrozenNorm, Rates, StagedBackbone, load_weights, read_weights
+from cohdc_train.models.staged import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights, rounded
 
 Depth = Literal[18, 34, 50, 101]
 _BLOCKS: dict[int, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
@@ -39,21 +39,21 @@ class HDCResNet(StagedBackbone):
         depth: Depth,
         width: float = 1.0,
         rates: Rates = ((1, 2, 3),) * 4,
-        norm: Literal["batch", "frozen"] = "batch",
+        norm: Norm = "batch",
         frozen_stages: int = 0,
     ) -> None:
         super().__init__()
         self.depth: Depth = depth
         block, blocks = _BLOCKS[depth]
-        norm_layer: Callable[..., nn.Module] = nn.BatchNorm2d if norm == "batch" else FrozenNorm
-        planes = [max(8, round(64 * width * 2**i / 8) * 8) for i in range(4)]
+        make_norm = norm_layer(norm)
+        planes = [rounded(64 * width * 2**i) for i in range(4)]
         self.conv1 = nn.Conv2d(3, planes[0], 7, stride=2, padding=3, bias=False)
-        self.bn1 = norm_layer(planes[0])
+        self.bn1 = make_norm(planes[0])
         self.relu = nn.ReLU(inplace=True)
         self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
         channels = planes[0]
         for i in range(4):
-            stage = _stage(block, channels, planes[i], blocks[i], 1 if i == 0 else 2, norm_layer)
+            stage = _stage(block, channels, planes[i], blocks[i], 1 if i == 0 else 2, make_norm)
             self.add_module(f"layer{i + 1}", stage)
             channels = planes[i] * block.expansion
         self.out_channels = [p * block.expansion for p in planes]
@@ -86,12 +86,12 @@ def _stage(
     planes: int,
     blocks: int,
     stride: int,
-    norm_layer: Callable[..., nn.Module],
+    make_norm: Callable[[int], nn.Module],
 ) -> nn.Sequential:
     out = planes * block.expansion
     shortcut = None
     if stride != 1 or channels != out:
-        shortcut = nn.Sequential(nn.Conv2d(channels, out, 1, stride=stride, bias=False), norm_layer(out))
-    first = block(channels, planes, stride, shortcut, norm_layer=norm_layer)
-    rest = [block(out, planes, norm_layer=norm_layer) for _ in range(blocks - 1)]
+        shortcut = nn.Sequential(nn.Conv2d(channels, out, 1, stride=stride, bias=False), make_norm(out))
+    first = block(channels, planes, stride, shortcut, norm_layer=make_norm)
+    rest = [block(out, planes, norm_layer=make_norm) for _ in range(blocks - 1)]
     return nn.Sequential(first, *rest)

@@ -1,9 +1,10 @@
 """What every backbone here is: a stem and four stages of strides 4, 8, 16, 32, whose 3x3 convolutions are dilated."""
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -14,6 +15,8 @@ from torchvision.ops import FrozenBatchNorm2d
 from cohdc_train.models.hdc import cycle
 
 Rates = Sequence[Sequence[int]]
+Norm = Literal["batch", "frozen"]  # frozen keeps statistics and scale
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..1
 
 
 class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not typed
@@ -24,6 +27,16 @@ class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not
             out: Tensor = super().forward(x)
             return out
         return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+
+
+def norm_layer(norm: Norm, eps: float = 1e-5) -> Callable[[int], nn.Module]:
+    """Channels -> the norm behind a convolution."""
+    return partial(nn.BatchNorm2d if norm == "batch" else FrozenNorm, eps=eps)
+
+
+def rounded(channels: float) -> int:
+    """The nearest multiple of 8, at least 8."""
+    return max(8, round(channels / 8) * 8)
 
 
 class StagedBackbone(nn.Module):

@@ -47,17 +47,21 @@ def _torchvisions(network):
     ).eval()
 
 
-def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
-    torch.manual_seed(1)
-    image = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0]
-    image = (image * 255).to(torch.uint8)
+def _assert_finds_what_torchvision_finds(network, image):
     with torch.inference_mode():
-        expected = _torchvisions(opinionated)([image / 255])[0]
-        found = detect(opinionated, [image])[0]
+        expected = _torchvisions(network)([image / 255])[0]
+        found = detect(network, [image])[0]
     assert len(found["scores"]) >= 3
     torch.testing.assert_close(found["boxes"], expected["boxes"], atol=1e-3, rtol=0)
     torch.testing.assert_close(found["scores"], expected["scores"], atol=1e-5, rtol=0)
     assert torch.equal(found["labels"] + 1, expected["labels"])
+
+
+def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
+    torch.manual_seed(1)
+    image = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0]
+    image = (image * 255).to(torch.uint8)
+    _assert_finds_what_torchvision_finds(opinionated, image)
 
 
 @pytest.mark.parametrize("backbone", ["mobilenet_v1", "mobilenet_v2"])
@@ -75,12 +79,7 @@ def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector
         network.rpn.head.cls_logits.weight.mul_(3)
         network.rpn.head.bbox_pred.weight.mul_(10)
     image = (torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0] * 255).to(torch.uint8)
-    with torch.inference_mode():
-        expected = _torchvisions(network)([image / 255])[0]
-        found = detect(network, [image])[0]
-    assert len(found["scores"]) >= 3
-    torch.testing.assert_close(found["boxes"], expected["boxes"], atol=1e-3, rtol=0)
-    torch.testing.assert_close(found["scores"], expected["scores"], atol=1e-5, rtol=0)
+    _assert_finds_what_torchvision_finds(network, image)
 
 
 def test_anchors_equal_torchvisions(opinionated):
