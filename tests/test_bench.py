@@ -7,10 +7,11 @@ from pathlib import Path
 import coco_toys
 import numpy as np
 import pytest
+import yaml
 
 from cohdc_train.bench import _fit_options, bench
 from cohdc_train.bench import entries as entries_module
-from cohdc_train.bench.entries import ROWS, Entry
+from cohdc_train.bench.entries import ROWS, Entry, row_config
 from cohdc_train.bench.speed import frame_rates, spread
 from cohdc_train.bench.table import _row, as_text, plot
 from cohdc_train.bench.training import call, train
@@ -108,9 +109,18 @@ def test_the_budget_is_epochs_or_minutes():
             _fit_options(None, [], epochs, minutes)
 
 
+def _renamed(folder, name):
+    (folder / name).write_text(row_config("ResNet50").read_text())
+    return str(folder / name)
+
+
 def test_unknown_rows_and_files_are_one_line(tmp_path):
     with pytest.raises(CohdcError, match="no row 'VGG'; there are HDC-Net, ResNet50, ResNet101, MobileNetV1"):
         bench(tmp_path, out=tmp_path / "o", rows=["VGG"], epochs=1)
+    with pytest.raises(CohdcError, match="two have the same name"):
+        bench(tmp_path, out=tmp_path / "o", rows=["ResNet50", _renamed(tmp_path, "ResNet50.yaml")], epochs=1)
+    with pytest.raises(CohdcError, match="weights are given for 'MobileNetV1', which is none of the rows"):
+        bench(tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"MobileNetV1": "x.pth"}, epochs=1)
     with pytest.raises(CohdcError, match="no row 'VGG'"):
         bench(tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"VGG": "x.pth"}, epochs=1)
     with pytest.raises(CohdcError, match=r"absent\.onnx: no such file"):
@@ -163,23 +173,47 @@ def test_an_interrupted_bench_goes_on_from_what_is_exported_and_scored(tmp_path,
     assert len(runs) == 2
 
 
-def test_every_row_is_a_network(small_config):
-    """The rows' options are those of `cohdc fit`, and their networks differ as their names say."""
-    from jsonargparse import ArgumentParser
-
+def network_of(row):
     from cohdc_train.models import MaskRCNN, NetworkConfig
 
-    parser = ArgumentParser()
-    parser.add_class_arguments(NetworkConfig, "model.network")
-    sizes = {}
-    for name, options in ROWS.items():
-        given = parser.parse_args([*options, "--model.network.width=0.125", "--model.network.fpn_channels=8"])
-        network = MaskRCNN(1, NetworkConfig(**vars(given.model.network)))
-        sizes[name] = sum(p.numel() for p in network.backbone.body.parameters())
+    shape = yaml.safe_load(row_config(row).read_text())["model"]["network"]
+    return MaskRCNN(1, NetworkConfig(**shape, canvas=(96, 128)))
+
+
+def test_rows_differ_as_their_names_say():
+    """Table 4's networks by tensors and rates: HDC-Net is dilated and has to be a tenth smaller than ResNet50."""
+    networks = {row: network_of(row) for row in (*ROWS, "networks/resnet50_hdc.yaml")}
+    body, whole = (
+        {row: sum(p.numel() for p in part(network).parameters()) for row, network in networks.items()}
+        for part in (lambda network: network.backbone.body, lambda network: network)
+    )
+    for row, network in networks.items():
         dilated = any(rate > 1 for stage in network.backbone.body.rates() for rate in stage)
-        assert dilated == (name == "HDC-Net")
-    assert sizes["HDC-Net"] == sizes["ResNet50"] < sizes["ResNet101"]
-    assert sizes["MobileNetV1"] < sizes["ResNet50"]
+        assert dilated == (row in ("HDC-Net", "networks/resnet50_hdc.yaml"))
+    assert body["MobileNetV1"] < body["ResNet50"] < body["ResNet101"]
+    assert whole["networks/resnet50_hdc.yaml"] == whole["ResNet50"]
+    assert whole["HDC-Net"] < 0.9 * whole["ResNet50"]
+
+
+def test_the_family_shrinks_from_m_to_n():
+    sizes = [sum(p.numel() for p in network_of(f"networks/hdc_net_{size}.yaml").parameters()) for size in "msn"]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] * 4 < 20e6  # bytes in float32; a fourth of it in int8
+
+
+def test_a_training_is_done_again_when_its_configuration_changes(tmp_path, monkeypatch):
+    calls = []
+
+    def fake(log, verb, *arguments, threads):
+        calls.append(arguments)
+        (tmp_path / "last.ckpt").write_bytes(b"weights")
+
+    monkeypatch.setattr("cohdc_train.bench.training.call", fake)
+    config = tmp_path / "c.yaml"
+    for text in ("a: 1", "a: 1", "a: 2"):
+        config.write_text(text)
+        train(tmp_path, [Path("d")], [f"--config={config}"])
+    assert len(calls) == 2
 
 
 @pytest.mark.slow
@@ -187,10 +221,15 @@ def test_every_row_is_a_network(small_config):
 def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
     data = coco_toys.folder(tmp_path / "data")
     (tmp_path / "tiny.yaml").write_text(TINY)
-    asked = {"rows": ["ResNet50", "MobileNetV1"], "fit_config": tmp_path / "tiny.yaml", "epochs": 1, "images": 2}
+    asked = {
+        "rows": ["networks/resnet50.yaml", "MobileNetV1"],
+        "fit_config": tmp_path / "tiny.yaml",
+        "epochs": 1,
+        "images": 2,
+    }
     table = bench(data, out=tmp_path / "out", **asked)
     written = json.loads((tmp_path / "out" / "table4.json").read_text())
-    assert [row["name"] for row in written] == ["ResNet50", "MobileNetV1"]
+    assert [row["name"] for row in written] == ["resnet50", "MobileNetV1"]
     for row in written:
         assert set(row) >= KEYS
         assert min(row[key] for key in ("train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "peak_mb")) > 0

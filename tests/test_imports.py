@@ -27,7 +27,7 @@ ALLOWED: dict[str, set[str]] = {
     "train": {"data", "models", "contour", "masks", "presets", "errors"},
     "validate": {"train", "data", "segmenter", "errors"},
     "export": {"validate", "train", "data", "models", "segmenter", "signature", "masks", "errors"},
-    "bench": {"validate", "train", "data", "models", "export", "segmenter", "contour", "masks", "errors"},
+    "bench": {"validate", "train", "data", "models", "export", "segmenter", "contour", "masks", "presets", "errors"},
     "segmenter": {"signature", "masks", "errors"},
     "predict": {"segmenter", "contour", "masks", "errors"},
     "slam": {"segmenter", "signature", "contour", "trajectory", "masks", "presets", "errors"},

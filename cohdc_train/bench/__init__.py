@@ -30,9 +30,10 @@ def bench(
     Args:
         data: COCO-format folder.
         out: folder for everything that is written.
-        rows: names among HDC-Net, ResNet50, ResNet101 and MobileNetV1; all when left out. An empty list trains none.
+        rows: names among HDC-Net, ResNet50, ResNet101 and MobileNetV1, and YAML files of other networks, shipped ones
+            such as networks/hdc_net_n.yaml too; the four names when left out. An empty list trains none.
         models: checkpoints of `cohdc fit` and ONNX files, foreign ones too, as further rows.
-        fit_config: configuration file of `cohdc fit` for all rows; what makes a row is put over it.
+        fit_config: configuration file of `cohdc fit` for all rows; a row's own network is put over it.
         weights: row -> ImageNet weights, by torchvision's name or as a file. Rows without start from random weights.
         options: further arguments of `cohdc fit` for all rows, such as '["--data.canvas=[240,320]"]'.
         epochs: budget of each training.

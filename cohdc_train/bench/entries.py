@@ -15,17 +15,15 @@ from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.export import export
 from cohdc_train.files import sha256, write_json
+from cohdc_train.presets import config_path
 from cohdc_train.train.metrics import Results
 from cohdc_train.validate import score_file
 
-_RESNET = "--model.network.backbone=resnet"
-_HDC = "--model.network.rates=[[1,2,3],[1,2,3],[1,2,3],[1,2,3]]"
-_PLAIN = "--model.network.rates=[[1],[1],[1],[1]]"
-ROWS: dict[str, tuple[str, ...]] = {
-    "HDC-Net": (_RESNET, "--model.network.depth=50", _HDC),  # the paper's: ResNet-50's tensors, dilated
-    "ResNet50": (_RESNET, "--model.network.depth=50", _PLAIN),
-    "ResNet101": (_RESNET, "--model.network.depth=101", _PLAIN),
-    "MobileNetV1": ("--model.network.backbone=mobilenet_v1", _PLAIN),
+ROWS = {  # the paper's, as shipped configurations
+    "HDC-Net": "networks/hdc_net_m.yaml",
+    "ResNet50": "networks/resnet50.yaml",
+    "ResNet101": "networks/resnet101.yaml",
+    "MobileNetV1": "networks/mobilenet_v1.yaml",
 }
 SCORES = {"ap": "segm_AP", "boundary_ap": "boundary_AP", "s90_matched": "S90_matched", "s90_all": "S90_all"}
 _IOU_FLOOR = 0.95  # of the polygons whose vertices are counted
@@ -53,7 +51,7 @@ class Entry:
 
 
 def trained_entry(
-    name: str,
+    row: str,
     seed: int,
     data: Path,
     folder: Path,
@@ -62,10 +60,23 @@ def trained_entry(
     threads: int,
     int8: bool,
 ) -> Entry:
-    """Train a row with a seed in a folder, or take what lies there."""
-    start = () if weights is None else (f"--model.network.weights={weights}",)
-    trained = train(folder, [data.resolve()], (*options, *ROWS[name], *start, f"--seed_everything={seed}"), threads)
-    return _exported(name, seed, trained, data, folder, threads, int8)
+    """Train a row with a seed in a folder, or take what lies there.
+
+    row: a name of ROWS or the YAML file of another network. Raises CohdcError when it is neither.
+    """
+    own = [f"--config={row_config(row)}", f"--seed_everything={seed}"]
+    if weights is not None:
+        own.append(f"--model.network.weights={weights}")
+    trained = train(folder, [data.resolve()], (*options, *own), threads)
+    return _exported(Path(row).stem, seed, trained, data, folder, threads, int8)
+
+
+def row_config(row: str) -> Path:
+    """The configuration of a row. Raises CohdcError naming a row that there is not."""
+    try:
+        return config_path(ROWS.get(row, row))
+    except CohdcError as error:
+        raise CohdcError(f"no row {row!r}; there are {', '.join(ROWS)}, and YAML files of networks") from error
 
 
 def finished_entry(model: Path, data: Path, folder: Path, threads: int, int8: bool) -> Entry:

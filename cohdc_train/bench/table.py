@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cohdc_train.bench.entries import ROWS, Entry, finished_entry, trained_entry
+from cohdc_train.bench.entries import ROWS, Entry, finished_entry, row_config, trained_entry
 from cohdc_train.bench.speed import Rate, frame_rates, peak_memory, runners_of, spread
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.datamodule import CocoDataModule
@@ -52,16 +52,21 @@ def run(
     int8: bool,
 ) -> list[Row]:
     """`cohdc_train.bench.bench`."""
-    names = list(ROWS) if rows is None else rows
-    if unknown := [name for name in (*names, *weights) if name not in ROWS]:
-        raise CohdcError(f"no row {unknown[0]!r}; there are {', '.join(ROWS)}")
+    wanted = list(ROWS) if rows is None else rows
+    for row in (*wanted, *weights):
+        row_config(row)
+    if strangers := set(weights) - set(wanted):
+        raise CohdcError(f"weights are given for {min(strangers)!r}, which is none of the rows")
+    names = {Path(row).stem: row for row in wanted}
+    if len(names) < len(wanted):
+        raise CohdcError(f"rows {', '.join(wanted)}: two have the same name")
     out.mkdir(parents=True, exist_ok=True)
     entries: dict[str, list[Entry]] = {}
     for seed in seeds:  # seed by seed, so that an interrupted bench has every row at few seeds
-        for name in names:
+        for name, row in names.items():
             folder = out / f"{name}_seed{seed}"
             print(f"{name}, seed {seed}", flush=True)
-            made = trained_entry(name, seed, data, folder, options, weights.get(name), threads, int8)
+            made = trained_entry(row, seed, data, folder, options, weights.get(row), threads, int8)
             entries.setdefault(name, []).append(made)
     for model in models:
         print(model, flush=True)

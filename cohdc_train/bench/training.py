@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.files import write_json
+from cohdc_train.files import sha256, write_json
+from cohdc_train.presets import config_path
 
 
 class Trained(NamedTuple):
@@ -26,7 +27,10 @@ def train(folder: Path, data: Sequence[Path], options: Sequence[str], threads: i
     data: COCO-format folders, the first one validated. Raises CohdcError naming the log when it fails.
     """
     kept, checkpoint = folder / "training.json", folder / "last.ckpt"
-    asked = {"data": [str(root) for root in data], "options": list(options), "threads": threads}
+    configs = {
+        option: sha256(config_path(option.partition("=")[2])) for option in options if option.startswith("--config=")
+    }
+    asked = {"data": [str(root) for root in data], "options": list(options), "configs": configs, "threads": threads}
     if kept.is_file() and checkpoint.is_file():
         known = json.loads(kept.read_text())
         if known["asked"] == asked:
