@@ -63,7 +63,7 @@ def predict(
 
     Args:
         source: an image, a folder of images, a video, or a webcam's number such as 0.
-        model: ONNX file written by `cohdc export`, or a foreign one that is known.
+        model: ONNX file written by `cohdc export`, a foreign one that is known, or a shipped network's name: person.
         out: folder for the results.
         score: least class score that is kept.
         quality: least mask quality that is kept; without it nothing is dropped for its quality.

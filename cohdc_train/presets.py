@@ -1,4 +1,4 @@
-"""Where the shipped YAML files lie: `configs/` of a checkout, its copy inside an installed wheel."""
+"""Where the shipped files lie: YAML in `configs/` of a checkout or its copy inside a wheel, networks in `shipped/`."""
 
 from pathlib import Path
 
@@ -20,3 +20,18 @@ def config_path(name: str | Path) -> Path:
         if (root / relative).is_file():
             return root / relative
     raise CohdcError(f"{name}: no such file, and no shipped config of that name")
+
+
+def model_path(name: str | Path) -> Path:
+    """The network a user means by `name`: a file that exists, else a shipped one such as `person`.
+
+    A name that is neither comes back as it is, for its reader to complain of.
+    """
+    given = Path(name)
+    shipped = _PACKAGE / "shipped" / f"{given}.onnx"
+    return shipped if not given.is_file() and given.name == str(given) and shipped.is_file() else given
+
+
+def shipped_models() -> list[str]:
+    """Names of the networks that come with the package."""
+    return sorted(file.stem for file in (_PACKAGE / "shipped").glob("*.onnx"))

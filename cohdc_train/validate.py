@@ -12,6 +12,7 @@ from cohdc_train.data.coco import CocoSplit
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
+from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.cli import told_in_one_line
 from cohdc_train.train.metrics import Results, SegmentationMetrics, category_names
@@ -35,7 +36,7 @@ def validate(
     """Print a model's scores on the validation split of a COCO-format folder.
 
     Args:
-        model: best.ckpt or last.ckpt of a training, or an ONNX file.
+        model: best.ckpt or last.ckpt of a training, an ONNX file, or a shipped network's name: person.
         root: the COCO-format folder; its other classes are left out. Of an ONNX file, those that both have are scored.
         out: JSON file for the scores.
         rescore: rank masks by score * quality; the training's choice when not given, yes for an ONNX file.
@@ -50,6 +51,7 @@ def validate(
     Raises:
         CohdcError: the model, the folder or their classes cannot be used.
     """
+    model = model_path(model)
     if model.suffix == ".onnx":
         if canvas is not None:
             raise CohdcError(f"{model}: its canvas was fixed by cohdc export --canvas")

@@ -15,7 +15,7 @@ from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.export import export
 from cohdc_train.files import sha256, write_json
-from cohdc_train.presets import config_path
+from cohdc_train.presets import config_path, model_path
 from cohdc_train.train.metrics import Results
 from cohdc_train.validate import score_file
 
@@ -81,6 +81,7 @@ def row_config(row: str) -> Path:
 
 def finished_entry(model: Path, data: Path, folder: Path, threads: int, int8: bool) -> Entry:
     """A checkpoint, exported into a folder, or an ONNX file as it is."""
+    model = model_path(model)
     if not model.is_file():
         raise CohdcError(f"{model}: no such file")
     if model.suffix == ".onnx":

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cohdc_train import signature
 from cohdc_train.errors import ContractError
+from cohdc_train.presets import model_path, shipped_models
 from cohdc_train.segmenter.detections import Detections
 from cohdc_train.segmenter.foreign import FOREIGN
 
@@ -35,7 +36,8 @@ class Segmenter:
     """Runs one ONNX file.
 
     Args:
-        path: a file written by `cohdc export`, or one of the foreign ones of `cohdc_train.segmenter.foreign`.
+        path: a file written by `cohdc export`, one of the foreign ones of `cohdc_train.segmenter.foreign`, or the name
+            of a network that comes with the package: "person".
         threads: onnxruntime's threads inside an operator; 0 leaves it to onnxruntime.
 
     Raises:
@@ -43,6 +45,7 @@ class Segmenter:
     """
 
     def __init__(self, path: Path, threads: int = 0) -> None:
+        path = model_path(path)
         session = open_session(path, threads)
         metadata: dict[str, str] = session.get_modelmeta().custom_metadata_map
         kind = None if signature.KEY_CONTRACT in metadata else next((k for k in FOREIGN if k.matches(session)), None)
@@ -59,7 +62,7 @@ class Segmenter:
 def open_session(path: Path, threads: int = 0) -> Any:
     """An onnxruntime session on the CPU. Raises ContractError when there is no such file or it is not ONNX."""
     if not Path(path).is_file():
-        raise ContractError(f"{path}: no such file")
+        raise ContractError(f"{path}: no such file, and no shipped network ({', '.join(shipped_models())})")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

@@ -53,7 +53,7 @@ def slam(
     Args:
         sequence: folder with rgb.txt, depth.txt and their images; groundtruth.txt is used for scores when there.
         out: folder for the results; files of a former run are replaced.
-        model: ONNX written by `cohdc export`; every frame is segmented.
+        model: ONNX written by `cohdc export`, or a shipped network's name: person; every frame is segmented.
         masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
         camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
         seed: of the random samples; the same seed gives the same numbers.
