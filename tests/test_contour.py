@@ -7,10 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cohdc_train.contour import BeetleSearch, Method, Polygon, rasterize, simplify, trace, vertices
+from cohdc_train.contour import METHODS, BeetleSearch, Method, Polygon, joined, rasterize, simplify, trace, vertices
+from cohdc_train.contour.coverage import Coverage, crossing
 
 SIZE = (96, 128)
 SEEDS = st.integers(0, 2**32 - 1)
+WITH_FLOOR = [method for method in METHODS if method != "dp"]
 FLOORS = st.sampled_from([0.8, 0.9, 0.95, 0.99, 1.0])
 
 
@@ -87,23 +89,23 @@ def test_filling_follows_pixel_centres(seed: int) -> None:
     assert np.array_equal(filled, inside)
 
 
-@given(SEEDS, FLOORS, st.sampled_from(["bisection", "bas_dp"]))
+@given(SEEDS, FLOORS, st.sampled_from(WITH_FLOOR))
 @settings(max_examples=40, deadline=None)
 def test_floor_holds_and_vertices_fall(seed: int, floor: float, method: Method) -> None:
     mask = blob(seed)
     polygons = trace(mask)
-    simpler = simplify(polygons, floor, method, search=BeetleSearch(iterations=5))
+    simpler = simplify(polygons, floor, method, search=BeetleSearch(n=3))
     assert iou(rasterize(simpler, SIZE), mask) >= floor
     assert vertices(simpler) <= vertices(polygons)
 
 
-@given(SEEDS, st.integers(0, 20), st.integers(0, 20), st.sampled_from(["bisection", "dp", "bas_dp"]))
+@given(SEEDS, st.integers(0, 20), st.integers(0, 20), st.sampled_from(METHODS))
 @settings(max_examples=25, deadline=None)
 def test_a_moved_mask_has_the_moved_polygon(seed: int, dx: int, dy: int, method: Method) -> None:
     mask = blob(seed)
     moved = np.zeros((SIZE[0] + 20, SIZE[1] + 20), bool)
     moved[dy : dy + SIZE[0], dx : dx + SIZE[1]] = mask
-    search = BeetleSearch(iterations=5)
+    search = BeetleSearch(n=3)
     here, there = (
         simplify(trace(mask), method=method, search=search),
         simplify(trace(moved), method=method, search=search),
@@ -133,3 +135,118 @@ def test_fixed_tolerance_knows_no_floor() -> None:
     polygons = trace(blob(5))
     coarse, fine = simplify(polygons, 1.0, "dp", epsilon=6), simplify(polygons, 1.0, "dp", epsilon=1)
     assert vertices(coarse) < vertices(fine) < vertices(polygons)
+
+
+def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
+    """Every edge against every other, in plain Python: whether two cross in a point inside both."""
+    edges = [(a, b) for ring in rings for a, b in zip(ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True)]
+
+    def side(a: list[float], b: list[float], c: list[float]) -> float:
+        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+    return any(
+        side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
+        for k, (a, b) in enumerate(edges)
+        for c, d in edges[:k]
+    )
+
+
+@given(SEEDS, FLOORS, st.sampled_from(WITH_FLOOR))
+@settings(max_examples=30, deadline=None)
+def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(seed: int, floor: float, method: Method) -> None:
+    """Holes turn against their outer ring."""
+    simpler = simplify(trace(blob(seed)), floor, method, search=BeetleSearch(n=3))
+    assert not cross_somewhere([ring for polygon in simpler for ring in polygon.rings])
+
+    def turn(ring: NDArray[np.float64]) -> float:
+        return float(np.sign(np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - ring[:, 1] * np.roll(ring[:, 0], -1))))
+
+    assert len({turn(polygon.outer) for polygon in simpler}) <= 1
+    assert all(turn(hole) == -turn(polygon.outer) for polygon in simpler for hole in polygon.holes)
+
+
+def test_crossing_tells_a_bow_tie_from_a_square_and_touching_from_crossing() -> None:
+    square = np.array([[0, 0], [4, 0], [4, 4], [0, 4]], float)
+    assert not crossing([square])
+    assert crossing([square[[0, 2, 1, 3]]])
+    assert crossing([square, square + 1])
+    assert not crossing([square, square + np.array([4, 0])])  # a side in common
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_coverage_by_edges_is_coverage_by_filling(seed: int) -> None:
+    mask = blob(seed)
+    polygons = trace(mask)
+    coarser = simplify(polygons, method="dp", epsilon=3)
+    rings = [ring for polygon in coarser for ring in polygon.rings]
+    if not cross_somewhere(rings):
+        assert Coverage(polygons).iou(coarser) == pytest.approx(iou(rasterize(coarser, SIZE), mask), abs=1e-12)
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_a_turned_mask_has_the_turned_outline(seed: int) -> None:
+    mask = blob(seed)
+    turned = trace(np.rot90(mask))  # (x, y) goes to (y, width - x)
+    points = {tuple(p) for polygon in trace(mask) for ring in polygon.rings for p in ring.tolist()}
+    assert {(y, SIZE[1] - x) for x, y in points} == {
+        tuple(p) for polygon in turned for ring in polygon.rings for p in ring.tolist()
+    }
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_one_ring_for_all_parts_fills_like_the_parts(seed: int) -> None:
+    polygons = trace(blob(seed))
+    assert np.array_equal(rasterize([Polygon(joined(polygons))], SIZE), rasterize(polygons, SIZE))
+
+
+def odd_masks() -> dict[str, NDArray[np.bool_]]:
+    y, x = np.mgrid[:60, :80]
+    line = np.zeros((60, 80), bool)
+    line[30, 5:70] = True
+    diagonal = np.eye(60, 80, dtype=bool)
+    return {
+        "line": line,
+        "diagonal": diagonal,
+        "full frame": np.ones((60, 80), bool),
+        "checkerboard": (x + y) % 2 == 0,
+        "200 parts": (x % 5 < 2) & (y % 4 < 2),
+        "ring of one pixel": (np.maximum(abs(x - 40), abs(y - 30)) == 20),
+    }
+
+
+@pytest.mark.parametrize("name", odd_masks())
+@pytest.mark.parametrize("method", METHODS)
+def test_odd_masks_have_outlines_that_keep_the_floor(name: str, method: Method) -> None:
+    mask = odd_masks()[name]
+    polygons = trace(mask)
+    simpler = simplify(polygons, 0.9, method, epsilon=0.25)
+    assert iou(rasterize(simpler, mask.shape), mask) >= 0.9
+    assert vertices(simpler) <= vertices(polygons)
+    if name == "full frame":
+        assert vertices(simpler) == 4
+
+
+def test_a_huge_mask_is_traced_and_simplified() -> None:
+    """8000 x 8000 px; with a full frame's area it would take minutes if a step were quadratic in pixels."""
+    mask = np.zeros((8000, 8000), bool)
+    cv2.ellipse(view := mask.view(np.uint8), (4000, 4000), (3500, 2000), 30, 0, 360, 1, -1)
+    simpler = simplify(trace(mask), 0.97, "bas_dp")
+    assert vertices(simpler) < 40
+    filled = rasterize(simpler, mask.shape)
+    assert np.count_nonzero(filled & mask) / np.count_nonzero(filled | mask) >= 0.97
+    assert view.any()
+
+
+def test_an_unknown_method_is_named() -> None:
+    with pytest.raises(ValueError, match="contour method 'rdp'; there are bisection, bas_dp, dp, visvalingam"):
+        simplify(trace(blob(0)), method="rdp")  # type: ignore[arg-type]
+
+
+def test_search_parameters_have_the_papers_names() -> None:
+    search = BeetleSearch(S=1.0, H=0.5, c=1.0, n=3)
+    assert search.k == 2
+    polygons = trace(blob(6))
+    assert vertices(simplify(polygons, 0.9, "bas_dp", search=search)) <= vertices(simplify(polygons, 0.9))

@@ -1,0 +1,105 @@
+"""A mask's exact outline with its parts and holes, and back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+_TIE = 1e-7  # px; an edge that near a pixel's centre goes through it, wherever the grid begins
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """One connected part of a mask. outer: [n, 2] px, n >= 3; holes: rings of the same kind inside it."""
+
+    outer: FloatArray
+    holes: tuple[FloatArray, ...] = ()
+
+    @property
+    def rings(self) -> tuple[FloatArray, ...]:
+        """The outer ring, then the holes."""
+        return (self.outer, *self.holes)
+
+    def keyhole(self) -> FloatArray:
+        """The part as one ring [n, 2], px: every hole is joined by a bridge of no width, for formats without holes."""
+        return _bridged(self.rings)
+
+
+def joined(polygons: Sequence[Polygon]) -> FloatArray:
+    """All parts as one ring [n, 2], px, joined by bridges of no width, for formats of one ring per object."""
+    return _bridged([polygon.keyhole() for polygon in polygons])
+
+
+def _bridged(rings: Sequence[FloatArray]) -> FloatArray:
+    ring = rings[0]
+    for other in rings[1:]:
+        gaps = np.linalg.norm(ring[:, None] - other, axis=2)
+        i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
+        ring = np.concatenate([ring[: i + 1], other[j:], other[: j + 1], ring[i:]])
+    return ring
+
+
+def trace(mask: NDArray[np.bool_]) -> list[Polygon]:
+    """The outline of a mask [H, W] along the edges of its pixels, one polygon per 8-connected part.
+
+    Filling the polygons gives exactly the mask back (inner corners are cut by half a pixel, which reaches no pixel's
+    centre); an empty mask has none.
+    """
+    # a grid of the pixels' corners and centres: every pixel sets its 3 x 3 nodes, so the border runs along pixel edges
+    nodes = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
+    nodes[1::2, 1::2] = mask
+    nodes = cv2.dilate(nodes, np.ones((3, 3), np.uint8))
+    found, hierarchy = cv2.findContours(nodes, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    rings = [ring.reshape(-1, 2).astype(np.float64) / 2 for ring in found]
+    parents = [] if hierarchy is None else hierarchy.reshape(-1, 4)[:, 3].tolist()
+    parts: dict[int, list[FloatArray]] = {k: [ring] for k, ring in enumerate(rings) if parents[k] < 0}
+    for ring, parent in zip(rings, parents, strict=True):
+        if parent >= 0:
+            parts[parent].append(ring)
+    return [Polygon(outer, tuple(holes)) for outer, *holes in parts.values()]
+
+
+def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Fill polygons by the even-odd rule at pixel centres. size: (height, width), px. Returns [height, width] bool."""
+    return _fill([ring for polygon in polygons for ring in polygon.rings], size)
+
+
+def _fill(rings: Sequence[FloatArray], size: tuple[int, int]) -> NDArray[np.bool_]:
+    height, width = size
+    if not rings:
+        return np.zeros(size, np.bool_)
+    start = np.concatenate(rings)
+    end = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
+    _, row, column, _ = crossings(start, end, size)
+    hits = np.bincount(row * width + column, minlength=(height + 1) * width).reshape(height + 1, width)
+    odd = np.bitwise_xor.accumulate((hits & 1).astype(np.uint8), axis=0)
+    return odd[:height].astype(np.bool_)
+
+
+def crossings(
+    start: FloatArray, end: FloatArray, size: tuple[int, int]
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Where edges cross the centre lines of a grid's columns.
+
+    start, end: [E, 2] px; size: (height, width). Returns the edge of each crossing, the row (0..height) of the first
+    pixel centre below it, its column, and +1 where the edge goes to the right, -1 where it goes to the left.
+    """
+    height, width = size
+    first, last = (np.ceil(points[:, 0] - 0.5).clip(0, width).astype(np.int64) for points in (start, end))
+    left, counts = np.minimum(first, last), np.abs(last - first)
+    edge = np.repeat(np.arange(len(start)), counts)
+    column = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts - left, counts)
+    d = end - start
+    slope = np.divide(d[:, 1], d[:, 0], out=np.zeros(len(d)), where=counts > 0)
+    y = (start[:, 1] - (start[:, 0] - 0.5) * slope)[edge] + column * slope[edge]
+    row = np.ceil(y - 0.5 - _TIE).clip(0, height).astype(np.int64)
+    return edge, row, column, np.sign(last - first)[edge]
+
+
+def vertices(polygons: Sequence[Polygon]) -> int:
+    """How many vertices polygons have together."""
+    return sum(len(ring) for polygon in polygons for ring in polygon.rings)

@@ -1,0 +1,131 @@
+"""Outlines of few vertices: Douglas-Peucker, Visvalingam, bisection on a tolerance, and BAS-DP (paper 2.1.3)."""
+
+from collections.abc import Callable, Sequence
+from heapq import heapify, heappop, heappush
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+
+from cohdc_train.contour.beetle import BeetleSearch, search_vertices
+from cohdc_train.contour.coverage import Coverage
+from cohdc_train.contour.polygons import FloatArray, Polygon, vertices
+
+Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
+METHODS: tuple[Method, ...] = get_args(Method)
+Reduction = Callable[[Sequence[Polygon], float], list[Polygon]]
+
+_BISECTIONS = 7  # evaluations, on a scale of equal ratios
+_FINEST, _COARSEST = 0.25, 0.1  # tolerances looked at: px, and a share of the outline's diagonal
+
+
+def simplify(
+    polygons: Sequence[Polygon],
+    iou_floor: float = 0.95,
+    method: Method = "bisection",
+    epsilon: float = 2.0,
+    search: BeetleSearch | None = None,
+) -> list[Polygon]:
+    """The same outline with fewer vertices.
+
+    `bisection` looks for the largest Douglas-Peucker tolerance that keeps the floor: the real-time path. `visvalingam`
+    does so with Visvalingam and Whyatt's triangles. `bas_dp` goes on from bisection: it drops vertices and moves the
+    rest by beetle antennae search (the paper's equation 2), and keeps the finer polygon when the floor cannot be
+    reached. `dp` is plain Douglas-Peucker with a fixed tolerance, which knows no floor.
+
+    Rings of a result do not cross themselves or each other within a part; where a coarser one would, the finer one
+    stays. Parts and holes too small to keep three vertices vanish where the floor allows it.
+
+    Args:
+        polygons: as `trace` gives them.
+        iou_floor: least IoU, 0..1, of the result with the polygons given, both filled at pixel centres; not of `dp`.
+        method: one of METHODS.
+        epsilon: the tolerance of `dp`, px.
+        search: parameters of `bas_dp`.
+
+    Raises:
+        ValueError: there is no such method.
+    """
+    if method not in METHODS:
+        raise ValueError(f"contour method {method!r}; there are {', '.join(METHODS)}")
+    if not polygons:
+        return []
+    if method == "dp":
+        return _douglas_peucker(polygons, epsilon)
+    coverage = Coverage(polygons)
+    finer = _bisect(polygons, iou_floor, coverage, _visvalingam if method == "visvalingam" else _douglas_peucker)
+    if method != "bas_dp":
+        return finer
+    return search_vertices(finer, iou_floor, coverage, search or BeetleSearch())
+
+
+def _bisect(polygons: Sequence[Polygon], iou_floor: float, coverage: Coverage, reduce: Reduction) -> list[Polygon]:
+    """The result with the fewest vertices among tolerances that keep the floor; the outline itself if none does."""
+    points = np.concatenate([polygon.outer for polygon in polygons])
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    low, high = np.log(_FINEST), np.log(max(_COARSEST * diagonal, 2 * _FINEST))
+    kept: list[list[Polygon]] = []
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        coarser = reduce(polygons, float(np.exp(middle)))
+        if coverage.iou(coarser) >= iou_floor:
+            low = middle
+            kept.append(coarser)
+        else:
+            high = middle
+    # The IoU does not fall evenly, so that a later one may have more vertices.
+    for coarser in sorted(kept, key=vertices):
+        if coverage.keep(coarser, iou_floor):
+            return coarser
+    return list(polygons)
+
+
+def _douglas_peucker(polygons: Sequence[Polygon], epsilon: float) -> list[Polygon]:
+    return _each_ring(
+        polygons,
+        lambda ring: cv2.approxPolyDP(ring.astype(np.float32), epsilon, True).reshape(-1, 2).astype(np.float64),
+    )
+
+
+def _visvalingam(polygons: Sequence[Polygon], epsilon: float) -> list[Polygon]:
+    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px, smallest first."""
+    return _each_ring(polygons, lambda ring: _without_small_triangles(ring, epsilon**2))
+
+
+def _each_ring(polygons: Sequence[Polygon], reduce: Callable[[FloatArray], FloatArray]) -> list[Polygon]:
+    reduced = []
+    for polygon in polygons:
+        outer, *holes = (reduce(ring) for ring in polygon.rings)
+        if len(outer) >= 3:
+            reduced.append(Polygon(outer, tuple(hole for hole in holes if len(hole) >= 3)))
+    return reduced
+
+
+def _without_small_triangles(ring: FloatArray, area: float) -> FloatArray:
+    x: list[float] = ring[:, 0].tolist()
+    y: list[float] = ring[:, 1].tolist()
+    count = len(ring)
+    before, after = [*range(-1, count - 1)], [*range(1, count), 0]
+    before[0] = count - 1
+
+    def triangle(i: int) -> float:
+        a, b = before[i], after[i]
+        twice: float = abs((x[a] - x[i]) * (y[b] - y[i]) - (y[a] - y[i]) * (x[b] - x[i]))
+        return twice / 2
+
+    heap = [(triangle(i), i) for i in range(count)]
+    heapify(heap)
+    size = {i: value for value, i in heap}
+    while heap and len(size) > 2:
+        value, i = heappop(heap)
+        if size.get(i) != value:  # gone, or of another area by now
+            continue
+        if value >= area:
+            break
+        del size[i]
+        a, b = before[i], after[i]
+        after[a], before[b] = b, a
+        for j in (a, b):
+            size[j] = max(triangle(j), value)  # never smaller than what went before it
+            heappush(heap, (size[j], j))
+    return ring[sorted(size)] if len(size) > 2 else ring[:0]

@@ -1,0 +1,106 @@
+"""`cohdc predict`: images, folders, videos or a webcam through an ONNX -> overlays and annotation files (no torch)."""
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from cohdc_train.contour import Method, simplify, trace
+from cohdc_train.files import write_bytes
+from cohdc_train.predict.annotation_files import Format, Found, coco, open_format
+from cohdc_train.predict.drawing import draw, jpeg
+from cohdc_train.predict.pictures import Image, Picture, read_pictures
+from cohdc_train.segmenter import Detections, Segmenter
+
+
+class Network(Protocol):
+    """What finds the objects: a `Segmenter`, or anything that answers like one."""
+
+    class_names: tuple[str, ...]
+
+    def __call__(self, rgb: Image, /) -> Detections:
+        """rgb: uint8 [H, W, 3] -> what was found."""
+
+
+def predict(
+    source: Path,
+    *,
+    model: Path,
+    out: Path,
+    score: float = 0.5,
+    quality: float | None = None,
+    format: Format = "coco",
+    contour: Method = "bas_dp",
+    iou_floor: float = 0.95,
+    check_below: float = 0.7,
+    threads: int = 0,
+    frames: int | None = None,
+) -> dict[str, Any]:
+    """Find objects in an image, a folder of images, a video or a webcam's pictures.
+
+    Writes `<name>_overlay.jpg` per image and the objects' polygons as one COCO file (predictions.json), a labelme file
+    per image, or YOLO-seg labels with their data.yaml. With labelme a person corrects contours instead of drawing them:
+    every shape has its score and quality, those to check come first, and review.txt lists the images by what is to do.
+    Returns the objects as a COCO dictionary, whatever was written. Raises DataError for images that cannot be read,
+    ContractError for a model that does not keep the contract.
+
+    Args:
+        source: an image, a folder of images, a video, or a webcam's number such as 0.
+        model: ONNX file written by `cohdc export`, a foreign one that is known, or a shipped network's name: person.
+        out: folder for the results.
+        score: least class score that is kept.
+        quality: least mask quality that is kept; without it nothing is dropped for its quality.
+        format: coco, labelme or yolo.
+        contour: how outlines become polygons: bas_dp has the fewest vertices, bisection is the fastest.
+        iou_floor: least IoU of a written polygon with its mask; 1 keeps every pixel.
+        check_below: mask quality below which a contour is marked to be checked, in labelme files.
+        threads: onnxruntime's threads; 0 leaves it to onnxruntime.
+        frames: most pictures that are looked at; when not given all there are, and 100 of a webcam.
+    """
+    pictures = read_pictures(source, frames)
+    network = Segmenter(model, threads)
+    started = time.perf_counter()
+    result = predict_pictures(
+        pictures, network, out, (score, quality), iou_floor, contour=contour, format=format, check_below=check_below
+    )
+    seconds = time.perf_counter() - started
+    images, objects = len(result["images"]), len(result["annotations"])
+    print(f"{objects} objects in {images} images, {1e3 * seconds / images:.0f} ms per image with drawing, in {out}")
+    return result
+
+
+def predict_pictures(
+    pictures: Iterable[Picture],
+    network: Network,
+    out: Path,
+    least: tuple[float, float | None] = (0.5, None),
+    iou_floor: float = 0.95,
+    *,
+    contour: Method = "bas_dp",
+    format: Format = "coco",
+    check_below: float = 0.7,
+) -> dict[str, Any]:
+    """Overlays and annotation files of pictures, in `out`. least: (score, quality or None) that are kept.
+
+    An object whose mask covers no pixel's centre has no outline and is left out. Returns the COCO dictionary.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    files = open_format(format, out, network.class_names, check_below)
+    seen: list[Found] = []
+    for picture in pictures:
+        found = _kept(network(picture.rgb), *least)
+        outlines = [simplify(trace(mask), iou_floor, contour) for mask in found.masks()]
+        found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
+        outlines = [outline for outline in outlines if outline]
+        write_bytes(out / f"{picture.stem}_overlay.jpg", jpeg(draw(picture.rgb, found, outlines)))
+        files.picture(picture, one := Found.of(picture, found, outlines))
+        seen.append(one)
+    files.close(seen)
+    return coco(seen, network.class_names)
+
+
+def _kept(found: Detections, score: float, quality: float | None) -> Detections:
+    keep = found.scores >= score
+    return found.select(keep if quality is None else keep & (found.quality >= quality))

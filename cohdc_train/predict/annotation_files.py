@@ -1,0 +1,180 @@
+"""What was found, as files that people and tools open: COCO, labelme, YOLO-seg."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol, Self
+
+import yaml
+
+from cohdc_train.contour import Polygon, joined
+from cohdc_train.contour.polygons import FloatArray
+from cohdc_train.files import write_bytes, write_text
+from cohdc_train.predict.drawing import jpeg
+from cohdc_train.predict.pictures import Picture
+from cohdc_train.segmenter import Detections
+
+Format = Literal["coco", "labelme", "yolo"]
+_LABELME = "5.5.0"  # whose files these are like
+
+
+class Found(NamedTuple):
+    """The objects of one picture, without its pixels.
+
+    name: the picture's file name; size: (height, width) px; found: the detections; outlines: polygons of each.
+    """
+
+    name: str
+    size: tuple[int, int]
+    found: Detections
+    outlines: list[list[Polygon]]
+
+    @classmethod
+    def of(cls, picture: Picture, found: Detections, outlines: list[list[Polygon]]) -> Self:
+        """The objects of a picture."""
+        return cls(picture.name, (picture.rgb.shape[0], picture.rgb.shape[1]), found, outlines)
+
+
+class Files(Protocol):
+    """How one format is written: picture by picture, and at the end."""
+
+    def picture(self, picture: Picture, one: Found, /) -> None:
+        """What belongs to one picture."""
+
+    def close(self, seen: Sequence[Found], /) -> None:
+        """What belongs to all of them."""
+
+
+def open_format(format: Format, out: Path, class_names: tuple[str, ...], check_below: float) -> Files:
+    """The writer of a format into a folder. check_below: quality below which labelme shapes are marked."""
+    if format == "labelme":
+        return _Labelme(out, class_names, check_below)
+    return _Yolo(out, class_names) if format == "yolo" else _Coco(out, class_names)
+
+
+def coco(seen: Sequence[Found], class_names: Sequence[str]) -> dict[str, Any]:
+    """A COCO dictionary; annotations have `score`, `quality`, `category` and `file_name` besides COCO's own fields."""
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for image_id, one in enumerate(seen, start=1):
+        height, width = one.size
+        images.append({"id": image_id, "file_name": one.name, "width": width, "height": height})
+        for row, outline in enumerate(one.outlines):
+            entry = {"id": len(annotations) + 1, "image_id": image_id, "file_name": one.name}
+            annotations.append(entry | _annotation(one.found, row, outline))
+    categories = [{"id": label + 1, "name": name} for label, name in enumerate(class_names)]
+    return {"images": images, "categories": categories, "annotations": annotations}
+
+
+def _annotation(found: Detections, row: int, outline: list[Polygon]) -> dict[str, Any]:
+    x0, y0, x1, y1 = (float(v) for v in found.boxes[row])
+    label = int(found.labels[row])
+    rings = [polygon.keyhole() for polygon in outline]
+    return {
+        "category_id": label + 1,
+        "category": found.class_names[label],
+        "bbox": [round(v, 2) for v in (x0, y0, x1 - x0, y1 - y0)],
+        **_trust(found, row),
+        "segmentation": [_numbers(ring) for ring in rings],
+        "area": round(sum(_area(ring) for ring in rings), 2),
+        "iscrowd": 0,
+    }
+
+
+def _trust(found: Detections, row: int) -> dict[str, float]:
+    return {"score": round(float(found.scores[row]), 5), "quality": round(float(found.quality[row]), 5)}
+
+
+def _area(ring: FloatArray) -> float:
+    x, y = ring.T
+    before, behind = [*range(-1, len(x) - 1)], [*range(1, len(x)), 0]
+    return float(abs(x @ (y[behind] - y[before])) / 2)
+
+
+def _numbers(ring: FloatArray) -> list[float]:
+    """x, y, x, y, ... on the grid of a tenth of a pixel that outlines have; whole numbers without a point."""
+    return [int(value) if value == int(value) else value for value in ring.ravel().round(1).tolist()]
+
+
+class _Coco:
+    """predictions.json."""
+
+    def __init__(self, out: Path, class_names: tuple[str, ...]) -> None:
+        self._out, self._names = out, class_names
+
+    def picture(self, picture: Picture, one: Found) -> None:
+        return
+
+    def close(self, seen: Sequence[Found]) -> None:
+        write_text(self._out / "predictions.json", json.dumps(coco(seen, self._names), separators=(",", ":")))
+
+
+class _Labelme:
+    """<name>.json per picture, and review.txt.
+
+    Parts of an object share a group; holes are joined to the outer ring. The picture is named relative to the folder;
+    frames are written beside their file.
+    """
+
+    def __init__(self, out: Path, class_names: tuple[str, ...], check_below: float) -> None:
+        self._out, self._names, self._check = out, class_names, check_below
+
+    def picture(self, picture: Picture, one: Found) -> None:
+        path = f"{picture.stem}.jpg"
+        if picture.path is not None:
+            path = Path(os.path.relpath(picture.path, self._out)).as_posix()
+        else:
+            write_bytes(self._out / path, jpeg(picture.rgb))
+        height, width = one.size
+        content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
+        content |= {"imagePath": path, "imageData": None, "imageHeight": height, "imageWidth": width}
+        write_text(self._out / f"{picture.stem}.json", json.dumps(content, indent=1))
+
+    def _shapes(self, one: Found) -> list[dict[str, Any]]:
+        shapes = []
+        for row in one.found.quality.argsort(kind="stable").tolist():
+            trust = _trust(one.found, row)
+            outline = one.outlines[row]
+            for polygon in outline:
+                numbers = _numbers(polygon.keyhole())
+                shape: dict[str, Any] = {"label": self._names[int(one.found.labels[row])]}
+                shape["points"] = [list(pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
+                shape |= {"group_id": row if len(outline) > 1 else None, "shape_type": "polygon", "mask": None}
+                shape["description"] = f"score {trust['score']:.2f} quality {trust['quality']:.2f}"
+                shape["flags"] = {"check": trust["quality"] < self._check}
+                shapes.append(shape)
+        return shapes
+
+    def close(self, seen: Sequence[Found]) -> None:
+        todo = [(int((one.found.quality < self._check).sum()), one) for one in seen]
+        lines = [
+            f"{one.name}: {count} of {len(one.outlines)} contours to check, the worst of quality "
+            f"{one.found.quality.min():.2f}"
+            for count, one in sorted(todo, key=lambda entry: (-entry[0], entry[1].found.quality.min(initial=1)))
+            if count
+        ]
+        write_text(self._out / "review.txt", "\n".join([*lines, ""]) if lines else "no contour to check\n")
+
+
+class _Yolo:
+    """labels/<name>.txt per picture and data.yaml: `class x y x y ...`, shares of the picture's width and height.
+
+    An object is one line: holes and further parts are joined by bridges of no width. There is no place for score and
+    quality.
+    """
+
+    def __init__(self, out: Path, class_names: tuple[str, ...]) -> None:
+        self._out, self._names = out, class_names
+        (out / "labels").mkdir(exist_ok=True)
+
+    def picture(self, picture: Picture, one: Found) -> None:
+        height, width = one.size
+        lines = []
+        for label, outline in zip(one.found.labels.tolist(), one.outlines, strict=True):
+            shares = (joined(outline) / (width, height)).ravel()
+            lines.append(" ".join([str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]))
+        write_text(self._out / "labels" / f"{picture.stem}.txt", "".join(f"{line}\n" for line in lines))
+
+    def close(self, seen: Sequence[Found]) -> None:
+        write_text(self._out / "data.yaml", yaml.safe_dump({"names": dict(enumerate(self._names))}, sort_keys=False))
