@@ -1,0 +1,100 @@
+"""The files `cohdc predict` writes, read back by the converters: the same objects, their masks above the floor."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from conversion import converted, iou, masks_of
+from test_predict import Fake, picture
+
+from cohdc_train.predict import predict_pictures
+from cohdc_train.predict.pictures import Picture, read_pictures
+
+FLOOR = 0.93
+
+
+def photographs(folder: Path) -> list[Picture]:
+    """Four of them, on disk."""
+    folder.mkdir()
+    for name in "abcd":
+        cv2.imwrite(str(folder / f"{name}.png"), picture().rgb)
+    return list(read_pictures(folder))
+
+
+def written(folder: Path, pictures: list[Picture], **options: Any) -> dict[str, Any]:
+    return predict_pictures(pictures, Fake(), folder, iou_floor=FLOOR, **options)
+
+
+def holds_what_was_found(found: list[tuple[str, Any]]) -> None:
+    masks = Fake()(picture().rgb).masks()
+    assert sorted(name for name, _ in found) == ["car", "person"]
+    for name, mask in found:
+        assert iou(mask, masks[("person", "car").index(name)].astype(np.uint8)) >= FLOOR - 0.01  # pycocotools fills it
+
+
+def test_labelme_files_come_back_as_the_same_objects(tmp_path: Path) -> None:
+    pictures = photographs(tmp_path / "photos")
+    written(tmp_path / "out", pictures, format="labelme")
+    for file in (tmp_path / "out").glob("*.jpg"):  # the overlays
+        file.unlink()
+    splits = converted("labelme", tmp_path / "out")
+    for name in "abcd":
+        holds_what_was_found(masks_of(splits, name))
+
+
+def test_labelme_shapes_are_what_labelme_writes_and_the_doubtful_come_first(tmp_path: Path) -> None:
+    written(tmp_path / "out", photographs(tmp_path / "photos"), format="labelme", check_below=0.5)
+    content = json.loads((tmp_path / "out" / "a.json").read_text())
+    assert set(content) == {"version", "flags", "shapes", "imagePath", "imageData", "imageHeight", "imageWidth"}
+    assert (content["imagePath"], content["imageHeight"], content["imageWidth"]) == ("../photos/a.png", 100, 120)
+    first, second = content["shapes"]
+    assert set(first) == {"label", "points", "group_id", "shape_type", "mask", "description", "flags"}
+    assert (first["label"], first["flags"], first["description"]) == ("car", {"check": True}, "score 0.60 quality 0.30")
+    assert (second["label"], second["flags"]) == ("person", {"check": False})
+    assert all(len(point) == 2 for point in first["points"])
+    assert (tmp_path / "out" / "review.txt").read_text().splitlines() == [
+        f"{name}.png: 1 of 2 contours to check, the worst of quality 0.30" for name in "abcd"
+    ]
+
+
+def test_a_frame_without_a_file_is_written_beside_its_labelme_file(tmp_path: Path) -> None:
+    written(tmp_path, [picture("walk_000000")], format="labelme", check_below=0.0)
+    content = json.loads((tmp_path / "walk_000000.json").read_text())
+    assert cv2.imread(str(tmp_path / content["imagePath"])).shape == (100, 120, 3)
+    assert (tmp_path / "review.txt").read_text() == "no contour to check\n"
+
+
+def test_yolo_labels_come_back_as_the_same_objects(tmp_path: Path) -> None:
+    pictures = photographs(tmp_path / "photos")
+    written(tmp_path / "out", pictures, format="yolo")
+    root = tmp_path / "set"
+    (root / "images").mkdir(parents=True)
+    for one in pictures:
+        cv2.imwrite(str(root / "images" / one.name), one.rgb)
+    (tmp_path / "out" / "labels").rename(root / "labels")
+    names = yaml.safe_load((tmp_path / "out" / "data.yaml").read_text())
+    assert names == {"names": {0: "person", 1: "car"}}
+    lines = (root / "labels" / "a.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["0", "1"]
+    assert all(0 <= float(value) <= 1 for line in lines for value in line.split()[1:])
+    (root / "last.txt").write_text("images/c.png\nimages/d.png\n")
+    (root / "first.txt").write_text("images/a.png\nimages/b.png\n")
+    (root / "data.yaml").write_text(yaml.safe_dump(names | {"train": "first.txt", "val": "last.txt"}))
+    splits = converted("yolo", root)
+    for name in "abcd":
+        holds_what_was_found(masks_of(splits, name))
+
+
+@pytest.mark.parametrize("format", ["coco", "labelme", "yolo"])
+def test_fewer_vertices_make_smaller_files(tmp_path: Path, format: Any) -> None:
+    sizes = {}
+    for floor in (0.9, 1.0):
+        folder = tmp_path / str(floor)
+        predict_pictures([picture()], Fake(), folder, iou_floor=floor, format=format, contour="bas_dp")
+        files = [file for file in folder.rglob("*") if file.suffix in (".json", ".txt") and file.name != "review.txt"]
+        sizes[floor] = sum(file.stat().st_size for file in files)
+    assert sizes[0.9] < sizes[1.0]
