@@ -1,5 +1,6 @@
 """Beetle antennae search over the vertices of an outline (paper 2.1.3, equation 2)."""
 
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +19,9 @@ class BeetleSearch:
         S: step, the length of the first move behind a dropped vertex, px.
         H: attenuation of the step with every move.
         c: ratio of the step to the whiskers' length d_0 = S / c.
-        n: moves behind a dropped vertex, before the search ends.
+        n: most moves behind a dropped vertex; when they do not lead back to the floor, the vertex stays.
+        pairs: whiskers of a beetle, in pairs of opposite directions; the paper's has one.
+        tries: vertices that are tried before the search ends, those that are missed least first.
         seed: of the random directions.
         k: parameters of one beetle: 2, a vertex. All the beetles together have the paper's k, twice the vertices.
     """
@@ -27,6 +30,8 @@ class BeetleSearch:
     H: float = 0.8
     c: float = 2.0
     n: int = 5
+    pairs: int = 4
+    tries: int = 2
     seed: int = 0
     k: int = field(default=2, init=False)
 
@@ -39,21 +44,13 @@ def search_vertices(finer: list[Polygon], iou_floor: float, coverage: Coverage, 
     if vertices(finer) > _MOST_VERTICES:
         return finer
     rng = np.random.default_rng(search.seed)
-    beetles = _Beetles(finer, coverage)
-    best = finer
-    while beetles.drop():
-        step = search.S
-        for _ in range(search.n):
-            beetles.move(step, step / search.c, rng)
-            step *= search.H
-            if beetles.iou() >= iou_floor:
-                break
+    beetles = _Beetles(finer, coverage, search.pairs)
+    best, failed = finer, 0
+    while failed < search.tries and (fewer := beetles.without(failed)) is not None:
+        if fewer.settle(iou_floor, search, rng) and coverage.keep(fewer.polygons(), iou_floor):
+            beetles, best, failed = fewer, fewer.polygons(), 0
         else:
-            break
-        candidate = beetles.polygons()
-        if not coverage.keep(candidate, iou_floor):
-            break
-        best = candidate
+            failed += 1
     return best
 
 
@@ -64,9 +61,9 @@ class _Beetles:
     move at the same time, so that the sum falls by what each of them gains.
     """
 
-    def __init__(self, polygons: list[Polygon], coverage: Coverage) -> None:
+    def __init__(self, polygons: list[Polygon], coverage: Coverage, pairs: int) -> None:
         rings = [ring for polygon in polygons for ring in polygon.rings]
-        self._coverage = coverage
+        self._coverage, self._pairs = coverage, pairs
         self._holes = [len(polygon.holes) for polygon in polygons]
         self._sizes = [len(ring) for ring in rings]
         self._x = np.concatenate(rings)
@@ -101,33 +98,49 @@ class _Beetles:
         stands; both are d_0 long here. The paper's head walks on from a worse place too, this one stays.
         """
         for index in self._turns:
-            x = self._x[index]
-            angle = rng.uniform(0, 2 * np.pi, len(index))
-            b = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            felt = self._coverage.nearest(np.stack([x, x + whisker * b, x - whisker * b]))
+            x, every = self._x[index], np.arange(len(index))
+            angle = rng.uniform(0, np.pi, len(index)) + np.arange(self._pairs)[:, None] * np.pi / self._pairs
+            b = np.stack([np.cos(angle), np.sin(angle)], axis=2)  # [pairs, m, 2]
+            felt = self._coverage.nearest(np.concatenate([x[None], x + whisker * b, x - whisker * b]))
             f = self._f(index, felt)
-            moved = self._coverage.nearest(x - step * b * np.sign(f[1] - f[2])[:, None])[None]
+            left, right = f[1 : 1 + self._pairs], f[1 + self._pairs :]
+            best = np.minimum(left, right).argmin(0)
+            towards = b[best, every] * np.sign(left - right)[best, every][:, None]
+            moved = self._coverage.nearest(x - step * towards)[None]
             felt, f = np.concatenate([felt, moved]), np.concatenate([f, self._f(index, moved)])
-            self._x[index] = felt[f.argmin(0), np.arange(len(index))]
+            self._x[index] = felt[f.argmin(0), every]
 
-    def drop(self) -> bool:
-        """Take the vertex away that is missed least; False when every ring is a triangle."""
-        free = np.repeat(np.array(self._sizes) > 3, self._sizes)
-        if not free.any():
-            return False
-        before, after = self._x[self._before], self._x[self._after]
-        without = self._coverage.difference(before, after)
-        cost = without - self._f(np.arange(len(self._x)), self._x[None])[0]
-        worst = int(np.where(free, cost, np.iinfo(np.int64).max).argmin())
-        self._sizes[int(np.searchsorted(np.cumsum(self._sizes), worst, "right"))] -= 1
-        self._x = np.delete(self._x, worst, axis=0)
-        self._link()
+    def settle(self, iou_floor: float, search: BeetleSearch, rng: np.random.Generator) -> bool:
+        """Move until the floor is kept; False when it is not after n moves."""
+        step, left = search.S, search.n
+        while self.iou() < iou_floor:
+            if not left:
+                return False
+            self.move(step, step / search.c, rng)
+            step, left = step * search.H, left - 1
         return True
+
+    def without(self, rank: int) -> "_Beetles | None":
+        """All but the vertex that is missed least, or next to least and so on; None when there is no such vertex.
+
+        Triangles keep theirs.
+        """
+        free = np.flatnonzero(np.repeat(np.array(self._sizes) > 3, self._sizes))
+        if rank >= len(free):
+            return None
+        here = self._x[free]
+        without = self._coverage.difference(self._x[self._before[free]], self._x[self._after[free]])
+        chosen = int(free[np.argsort(without - self._f(free, here[None])[0], kind="stable")[rank]])
+        fewer = copy(self)
+        fewer._sizes = self._sizes.copy()
+        fewer._sizes[int(np.searchsorted(np.cumsum(self._sizes), chosen, "right"))] -= 1
+        fewer._x = np.delete(self._x, chosen, axis=0)
+        fewer._link()
+        return fewer
 
     def iou(self) -> float:
         """With the outline, 0..1, as long as no ring crosses itself."""
-        covered, common = self._coverage.edges(self._x, self._x[self._after])
-        return self._coverage.ratio(int(covered.sum()), int(common.sum()))
+        return self._coverage.ratio(*self._coverage.between(self._x, self._x[self._after]))
 
     def polygons(self) -> list[Polygon]:
         """What the beetles stand around."""

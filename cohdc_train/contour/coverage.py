@@ -26,43 +26,41 @@ class Coverage:
         self._size = (height, width)
         self._filled = self._fill(polygons)
         self.area = int(np.count_nonzero(self._filled))
-        self._sums = cv2.integral(self._filled.view(np.uint8))  # of the pixels above and left of each corner
+        sums = cv2.integral(self._filled.view(np.uint8))  # of the pixels above and left of each corner
+        self._above = np.ascontiguousarray(sums[:, 1:] - sums[:, :-1]).ravel()  # pixels of it above, per row and column
+        self._alone = np.repeat(np.arange(height + 1, dtype=np.int32), width) - 2 * self._above
         self._sign = 1
         covered, _ = self.sums(polygons)
         self._sign = -1 if covered < 0 else 1
 
-    def edges(self, start: FloatArray, end: FloatArray) -> tuple[IntArray, IntArray]:
-        """What edges [E, 2] -> [E, 2] add to the area covered and to the area in common, px each: two [E]."""
-        edge, area, shared = self._crossed(start, end)
-        covered, common = (np.bincount(edge, part, len(start)).astype(np.int64) for part in (area, shared))
-        return covered, common
-
-    def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
-        """The edge of every crossing, and what is above it: rows, and pixels of the outline, with its sign."""
-        edge, row, column, direction = crossings(start - self.low, end - self.low, self._size)
-        direction *= self._sign
-        return edge, direction * row, direction * (self._sums[row, column + 1] - self._sums[row, column])
-
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
-        """What edges add to the pixels that only one of the two has, less a constant: [E]."""
-        covered, common = self.edges(start, end)
-        return covered - 2 * common
-
-    def nearest(self, points: FloatArray) -> FloatArray:
-        """Points [..., 2] moved onto the GRID and into the outline's bounds."""
-        local = np.round((points - self.low) / GRID) * GRID
-        placed: FloatArray = self.low + np.clip(local, 0, self.high - self.low)
-        return placed
+        """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has, less a constant: [E]."""
+        edge, place, _, direction = self._crossed(start, end)
+        return np.bincount(edge, direction * self._alone[place], len(start)).astype(np.int64)
 
     def sums(self, polygons: Sequence[Polygon]) -> tuple[int, int]:
         """Area covered and area in common of polygons without crossing rings, px."""
         rings = [ring for polygon in polygons for ring in polygon.rings]
         if not rings:
             return 0, 0
-        start = np.concatenate(rings)
         end = np.concatenate([np.concatenate([ring[1:], ring[:1]]) for ring in rings])
-        _, area, shared = self._crossed(start, end)
-        return int(area.sum()), int(shared.sum())
+        return self.between(np.concatenate(rings), end)
+
+    def between(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
+        """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
+        _, place, row, direction = self._crossed(start, end)
+        return int(direction @ row), int(direction @ self._above[place])
+
+    def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Crossings of edges with the columns: the edge, the place in the tables, the row, and the sign it counts by."""
+        edge, row, column, direction = crossings(start - self.low, end - self.low, self._size)
+        return edge, row * self._size[1] + column, row, direction * self._sign
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Points [..., 2] moved onto the GRID and into the outline's bounds."""
+        local = np.round((points - self.low) / GRID) * GRID
+        placed: FloatArray = self.low + np.clip(local, 0, self.high - self.low)
+        return placed
 
     def iou(self, polygons: Sequence[Polygon]) -> float:
         """IoU of polygons without crossing rings that lie within the bounds, 0..1."""
