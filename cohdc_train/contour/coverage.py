@@ -52,7 +52,7 @@ class Coverage:
         return int(direction @ row), int(direction @ self._above[place])
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Crossings of edges with the columns: the edge, the place in the tables, the row, and the sign it counts by."""
+        """Crossings of edges with the columns: the edge, the place in the tables, the row, the sign it counts by."""
         edge, row, column, direction = crossings(start - self.low, end - self.low, self._size)
         return edge, row * self._size[1] + column, row, direction * self._sign
 

@@ -46,8 +46,18 @@ def grow(mask: Mask, radius: float) -> Mask:
     """[H, W] bool, True within `radius` px of a True pixel of `mask`."""
     if radius <= 0 or not mask.any():
         return mask
-    distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    return np.asarray(distance <= radius)
+    rows, columns = np.nonzero(mask)
+    window = (_reach(rows, radius), _reach(columns, radius))
+    distance = cv2.distanceTransform((~mask[window]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    grown = np.zeros_like(mask)
+    grown[window] = distance <= radius
+    return grown
+
+
+def _reach(places: NDArray[np.int64], radius: float) -> slice:
+    """From the first place to the last, with `radius` more on both sides."""
+    margin = int(np.ceil(radius))
+    return slice(max(int(places.min()) - margin, 0), int(places.max()) + margin + 1)
 
 
 def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Culling) -> Mask:

@@ -1,7 +1,10 @@
 """Corners: the mask before the budget, the grid, the depth that is trusted; masks made of detections."""
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plane_world import CAMERA, render, room
 
 from cohdc_train.errors import DataError
@@ -97,6 +100,17 @@ def test_the_papers_filter_leaves_a_doubted_contour_out() -> None:
     for quality, dynamic in ((0.95, True), (0.85, False)):
         found = dynamic_mask(detections((box, 0, 0.9, quality)), frozenset([0]), Culling(quality=0.9, dilate=0))
         assert found.any() == dynamic
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 40.0))
+@settings(max_examples=30, deadline=None)
+def test_grow_looks_at_a_window_and_gives_what_the_whole_image_would(seed: int, radius: float) -> None:
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((60, 80), bool)
+    for row, column in zip(rng.integers(0, 60, 3), rng.integers(0, 80, 3), strict=True):
+        mask[row : row + 7, column : column + 4] = True
+    whole = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= radius
+    assert np.array_equal(grow(mask, radius), whole)
 
 
 def test_grow_is_a_disc() -> None:
