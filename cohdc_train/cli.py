@@ -19,7 +19,7 @@ class Verb(NamedTuple):
 VERBS = {
     "demo": Verb("demo", "demo", "the whole way on a rendered room: data, training, ONNX, SLAM, scores, report"),
     "data": Verb(
-        "data.commands", "COMMANDS", "look at a COCO-format folder, or make one of labelme, VIA, YOLO or VOC files"
+        "data.commands", "COMMANDS", "look at a COCO-format folder, make one of other formats, fetch a TUM sequence"
     ),
     "synth": Verb("synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"),
     "fit": Verb("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),

@@ -2,5 +2,6 @@
 
 from cohdc_train.data.convert import convert
 from cohdc_train.data.doctor import doctor, stats
+from cohdc_train.data.tum import tum
 
-COMMANDS = {"stats": stats, "doctor": doctor, "convert": convert}
+COMMANDS = {"stats": stats, "doctor": doctor, "convert": convert, "tum": tum}

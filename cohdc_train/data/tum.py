@@ -1,0 +1,148 @@
+"""`cohdc data tum`: a sequence of the TUM RGB-D benchmark, from its publisher or from an archive (no torch)."""
+
+import os
+import tarfile
+import urllib.request
+import zlib
+from http.client import HTTPException
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from cohdc_train.errors import DataError
+from cohdc_train.files import new_folder, sha256
+
+HOST = "https://cvg.cit.tum.de/rgbd/dataset"
+_PREFIX = "rgbd_dataset_"
+SEQUENCES = (
+    *("freiburg1_xyz", "freiburg1_rpy", "freiburg1_360", "freiburg1_floor", "freiburg1_desk", "freiburg1_desk2"),
+    *("freiburg1_room", "freiburg2_xyz", "freiburg2_rpy", "freiburg2_desk", "freiburg2_desk_with_person"),
+    *("freiburg3_long_office_household", "freiburg3_sitting_static", "freiburg3_sitting_xyz"),
+    *("freiburg3_sitting_halfsphere", "freiburg3_sitting_rpy", "freiburg3_walking_static", "freiburg3_walking_xyz"),
+    *("freiburg3_walking_halfsphere", "freiburg3_walking_rpy"),
+)
+_LISTS = ("rgb.txt", "depth.txt")
+_CHUNK = 1 << 20
+
+
+def tum(
+    name: str, *, out: Path = Path("tum"), archive: Path | None = None, digest: str | None = None, host: str = HOST
+) -> Path:
+    """Fetch a sequence of the TUM RGB-D benchmark, check it, and unpack it into OUT/rgbd_dataset_NAME.
+
+    A download that was cut off goes on where it stopped. Every image that rgb.txt and depth.txt list has to be there,
+    or no folder is left. Returns the folder; one that is there already is checked and kept.
+
+    Args:
+        name: such as walking_xyz, freiburg3_walking_xyz or rgbd_dataset_freiburg3_walking_xyz.
+        out: folder for the archive and the sequence.
+        archive: the .tgz, fetched by hand.
+        digest: SHA-256 that the archive must have. The publisher gives none; what was read is printed.
+        host: where the folders freiburg1 to freiburg3 lie.
+
+    Raises:
+        DataError: there is no such sequence, the publisher cannot be reached, or the archive is damaged or incomplete.
+    """
+    sequence = _sequence(name)
+    folder = out / f"{_PREFIX}{sequence}"
+    if folder.is_dir():
+        print(f"{folder}: {_check(folder)} images, already there")
+        return folder
+    out.mkdir(parents=True, exist_ok=True)
+    file = archive
+    if file is None:
+        url = f"{host}/{sequence.partition('_')[0]}/{folder.name}.tgz"
+        file = out / f"{folder.name}.tgz"
+        if not file.is_file():
+            _download(url, file)
+    found = sha256(file)
+    if digest is not None and found != digest.lower():
+        raise DataError(f"{file}: SHA-256 {found}, expected {digest.lower()}")
+    with new_folder(folder) as draft:
+        _unpack(file, folder.name, draft)
+        count = _check(draft, file)
+    print(f"{folder}: {count} images, SHA-256 of the archive {found}")
+    return folder
+
+
+def _sequence(name: str) -> str:
+    wanted = name.removeprefix(_PREFIX)
+    matches = [known for known in SEQUENCES if known == wanted] or [
+        known for known in SEQUENCES if known.partition("_")[2] == wanted
+    ]
+    if len(matches) == 1:
+        return matches[0]
+    others = ", ".join(matches or SEQUENCES)
+    raise DataError(f"TUM sequence {name!r}: " + (f"is {others}" if matches else f"there are {others}"))
+
+
+def _download(url: str, file: Path) -> None:
+    """To FILE.part, from its end on where there is one, renamed when it is whole."""
+    part = file.with_name(file.name + ".part")
+    have = part.stat().st_size if part.is_file() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            if have and answer.status != 206:  # the host gives the whole file again
+                have = 0
+            length = answer.headers.get("Content-Length")
+            total = None if length is None else have + int(length)
+            with part.open("ab" if have else "wb") as stream:
+                _copy(answer, stream, have, total)
+    except (OSError, HTTPException) as error:
+        reason = getattr(error, "reason", None) or error
+        raise DataError(
+            f"{url}: cannot be fetched: {reason}; fetch it by hand and give --archive FILE, or try again to go on"
+        ) from error
+    size = part.stat().st_size
+    if total is not None and size != total:
+        raise DataError(f"{part}: {size} of {total} bytes arrived; try again to go on")
+    os.replace(part, file)
+
+
+def _copy(answer: Any, stream: Any, done: int, total: int | None) -> None:
+    told = 0
+    while chunk := answer.read(_CHUNK):
+        stream.write(chunk)
+        done += len(chunk)
+        if total and 10 * done // total > told:
+            told = 10 * done // total
+            print(f"{10 * told} % of {total / 1e6:.0f} MB", flush=True)
+
+
+def _unpack(file: Path, inside: str, target: Path) -> None:
+    """Regular files below the folder `inside` of an archive; nothing that leads out of the target, and no links."""
+    try:
+        with tarfile.open(file, "r:*") as tar:
+            for member in tar:
+                path = PurePosixPath(member.name)
+                parts = [part for part in path.parts if part != "."]
+                if path.is_absolute() or ".." in parts or not (member.isfile() or member.isdir()):
+                    raise DataError(f"{file}: entry {member.name!r} is a link or leads out of the folder")
+                if not member.isfile() or parts[:1] != [inside]:
+                    continue
+                place = target.joinpath(*parts[1:])
+                place.parent.mkdir(parents=True, exist_ok=True)
+                source = tar.extractfile(member)
+                assert source is not None  # of a regular file
+                with source, place.open("wb") as stream:
+                    while chunk := source.read(_CHUNK):
+                        stream.write(chunk)
+    except (tarfile.TarError, EOFError, OSError, zlib.error) as error:
+        raise DataError(f"{file}: not a whole .tgz: {error}") from error
+
+
+def _check(folder: Path, named: Path | None = None) -> int:
+    """How many images the lists name, all of them there. Raises DataError naming the first thing that is missing."""
+    count = 0
+    for name in (*_LISTS, "groundtruth.txt"):
+        if not (folder / name).is_file():
+            raise DataError(f"{named or folder}: no {name}")
+    for name in _LISTS:
+        for number, line in enumerate((folder / name).read_text().splitlines(), start=1):
+            words = line.split("#")[0].split()
+            if not words:
+                continue
+            if len(words) < 2 or not (folder / words[1]).is_file():
+                raise DataError(f"{named or folder}: {name} line {number}: {' '.join(words)!r} is not there")
+            count += 1
+    return count
