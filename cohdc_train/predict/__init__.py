@@ -40,11 +40,11 @@ def predict(
 ) -> dict[str, Any]:
     """Find objects in an image, a folder of images, a video or a webcam's pictures.
 
-    Writes `<name>_overlay.jpg` per image and the objects' polygons as one COCO file (predictions.json), a labelme file
-    per image, or YOLO-seg labels with their data.yaml. With labelme a person corrects contours instead of drawing them:
-    every shape has its score and quality, those to check come first, and review.txt lists the images by what is to do.
-    Returns the objects as a COCO dictionary, whatever was written. Raises DataError for images that cannot be read,
-    ContractError for a model that does not keep the contract.
+    Writes `<name>_overlay.jpg` per image (in overlays/ unless the format is coco) and the objects' polygons: one COCO
+    file (predictions.json), a labelme file per image, or YOLO-seg labels with their data.yaml. With labelme a person
+    corrects contours instead of drawing them: every shape has its score and quality, those to check come first, and
+    review.txt lists the images by what is to do. Returns the objects as a COCO dictionary, whatever was written.
+    Raises DataError for images that cannot be read, ContractError for a model that does not keep the contract.
 
     Args:
         source: an image, a folder of images, a video, or a webcam's number such as 0.
@@ -88,13 +88,15 @@ def predict_pictures(
     """
     out.mkdir(parents=True, exist_ok=True)
     files = open_format(format, out, network.class_names, check_below)
+    overlays = out if format == "coco" else out / "overlays"  # apart from a folder that tools take for a data set
+    overlays.mkdir(exist_ok=True)
     seen: list[Found] = []
     for picture in pictures:
         found = _kept(network(picture.rgb), *least)
         outlines = [simplify(trace(mask), iou_floor, contour) for mask in found.masks()]
         found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
         outlines = [outline for outline in outlines if outline]
-        write_bytes(out / f"{picture.stem}_overlay.jpg", jpeg(draw(picture.rgb, found, outlines)))
+        write_bytes(overlays / f"{picture.stem}_overlay.jpg", jpeg(draw(picture.rgb, found, outlines)))
         files.picture(picture, one := Found.of(picture, found, outlines))
         seen.append(one)
     files.close(seen)

@@ -62,7 +62,7 @@ class Segmenter:
 def open_session(path: Path, threads: int = 0) -> Any:
     """An onnxruntime session on the CPU. Raises ContractError when there is no such file or it is not ONNX."""
     if not Path(path).is_file():
-        raise ContractError(f"{path}: no such file, and no shipped network ({', '.join(shipped_models())})")
+        raise ContractError(f"{path}: no such file; shipped networks: {', '.join(shipped_models())}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
