@@ -1,6 +1,7 @@
 """How well polygons cover an outline, told edge by edge."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -28,10 +29,15 @@ class Coverage:
         self.area = int(np.count_nonzero(self._filled))
         sums = cv2.integral(self._filled.view(np.uint8))  # of the pixels above and left of each corner
         self._above = np.ascontiguousarray(sums[:, 1:] - sums[:, :-1]).ravel()  # pixels of it above, per row and column
-        self._alone = np.repeat(np.arange(height + 1, dtype=np.int32), width) - 2 * self._above
-        self._sign = 1
-        covered, _ = self.sums(polygons)
-        self._sign = -1 if covered < 0 else 1
+        x, y = polygons[0].outer.T
+        turn = x @ np.roll(y, -1) - y @ np.roll(x, -1)  # to the right along the bottom where it is negative
+        self._sign = -1 if turn > 0 else 1
+
+    @cached_property
+    def _alone(self) -> NDArray[np.int32]:
+        """Rows above less twice the outline's pixels above, per row and column."""
+        height, width = self._size
+        return np.repeat(np.arange(height + 1, dtype=np.int32), width) - 2 * self._above
 
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
         """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has, less a constant: [E]."""

@@ -76,8 +76,8 @@ def _fill(rings: Sequence[FloatArray], size: tuple[int, int]) -> NDArray[np.bool
     end = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
     _, row, column, _ = crossings(start, end, size)
     hits = np.bincount(row * width + column, minlength=(height + 1) * width).reshape(height + 1, width)
-    odd = np.bitwise_xor.accumulate((hits & 1).astype(np.uint8), axis=0)
-    return odd[:height].astype(np.bool_)
+    odd = np.bitwise_xor.accumulate(hits[:height].astype(np.uint8), axis=0) & 1
+    return odd.view(np.bool_)
 
 
 def crossings(
