@@ -29,6 +29,7 @@ VERBS = {
     "bench": Verb("bench", "bench", "Table 4: networks trained, exported, scored and timed side by side"),
     "slam": Verb("slam.run", "slam", "RGB-D sequence -> trajectory, map tracking with people removed (no torch)"),
     "evaluate": Verb("trajectory", "evaluate", "ATE and RPE of a trajectory against ground truth"),
+    "report": Verb("report", "report", "one HTML page of a SLAM run: scores, trajectory, times, pictures"),
     "env": Verb("env", "env", "versions of everything that matters, and what is wrong with them"),
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
@@ -57,7 +58,11 @@ class Table:
 
 @dataclass(frozen=True)
 class _Run:
-    """One SLAM run. truth, estimate: matched poses, the estimate aligned to the truth; None when too few matched."""
+    """One SLAM run.
+
+    truth, estimate: matched poses, the estimate aligned to the truth; None when too few matched. Without ground truth
+    the estimate stands as it is.
+    """
 
     label: str
     folder: Path
@@ -66,29 +71,61 @@ class _Run:
     estimate: Trajectory | None
 
 
+def report(run: Path, *, against: Path | None = None, groundtruth: Path | None = None, out: Path | None = None) -> Path:
+    """One HTML page of a SLAM run's scores, trajectory, times and pictures; nothing beside it is needed to read it.
+
+    Returns the page. Raises DataError naming a file of a run that cannot be used.
+
+    Args:
+        run: folder written by `cohdc slam`.
+        against: another run on the same sequence, such as one without masks.
+        groundtruth: TUM file; groundtruth.txt of the run's sequence when not given and there.
+        out: the HTML file; report.html in the run's folder when not given.
+    """
+    if groundtruth is None:
+        beside = Path(_config(run).get("sequence", "")) / "groundtruth.txt"
+        groundtruth = beside if beside.is_file() else None
+    runs = {run.name: run} if against is None else {f"{against.name}, against": against, run.name: run}
+    page = out if out is not None else run / "report.html"
+    write_report(page, run.name, groundtruth, runs)
+    print(page)
+    return page
+
+
+def _config(run: Path) -> dict[str, Any]:
+    file = run / "config.yaml"
+    try:
+        config = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise DataError(f"{file}: cannot be read; is {run} a folder of cohdc slam? ({error})") from error
+    return config if isinstance(config, dict) else {}
+
+
 def write_report(
     out: Path,
     title: str,
-    groundtruth: Path,
+    groundtruth: Path | None,
     runs: Mapping[str, Path],
     overlays: Sequence[Path] = (),
     tables: Sequence[Table] = (),
 ) -> None:
     """Write one self-contained HTML page about SLAM runs on a sequence.
 
-    out: the HTML file, written whole or not at all; groundtruth: TUM file; runs: label -> folder written by `slam`
-    (trajectory.txt, metrics.json, pictures/<stamp>_before.jpg and _after.jpg); overlays: JPEG or PNG images of
-    predicted masks; tables: shown first. Sections without content are left out.
+    out: the HTML file, written whole or not at all; groundtruth: TUM file, None where there is none; runs: label ->
+    folder written by `slam` (trajectory.txt, metrics.json, pictures/<stamp>_before.jpg and _after.jpg); overlays: JPEG
+    or PNG images of predicted masks; tables: shown first. Sections without content are left out.
     Raises DataError naming a file of a run or an image that cannot be used.
     """
-    truth = read_tum(groundtruth)
+    truth = None if groundtruth is None else read_tum(groundtruth)
     loaded = [_load(label, folder, truth) for label, folder in runs.items()]
     parts = [table.html() for table in (*tables, *_metric_tables(loaded))]
     aligned = [run for run in loaded if run.estimate is not None]
     if aligned:
-        parts.append("<h2>Trajectory against ground truth</h2>")
-        parts.append(_svg(_plot_paths(truth, aligned), "seen from above and from the side, after rigid alignment"))
+        parts.append(f"<h2>Trajectory{'' if truth is None else ' against ground truth'}</h2>")
+        how = "" if truth is None else ", after rigid alignment"
+        parts.append(_svg(_plot_paths(truth, aligned), f"seen from above and from the side{how}"))
         parts.append(_svg(_plot_over_time(truth, aligned), "position over time"))
+    if aligned and truth is not None:
         parts.append("<h2>Absolute trajectory error over time</h2>")
         parts.append(
             _svg(_plot_errors(truth, aligned), "distance to ground truth of every matched pose, after alignment")
@@ -110,7 +147,7 @@ def _write(out: Path, title: str, parts: Sequence[str]) -> None:
     write_text(out, f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n')
 
 
-def _load(label: str, folder: Path, truth: Trajectory) -> _Run:
+def _load(label: str, folder: Path, truth: Trajectory | None) -> _Run:
     file = folder / "metrics.json"
     try:
         metrics = json.loads(file.read_text(encoding="utf-8"))
@@ -119,6 +156,8 @@ def _load(label: str, folder: Path, truth: Trajectory) -> _Run:
     if metrics.get("coverage") == 0:  # a tracker that was never on its way has no pose to plot
         return _Run(label, folder, metrics, None, None)
     estimate = read_tum(folder / "trajectory.txt")
+    if truth is None:
+        return _Run(label, folder, metrics, None, estimate)
     try:
         matched_truth, matched = match(truth, estimate)
     except DataError:
@@ -163,15 +202,15 @@ def _opened(trajectory: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.flo
     return stamps, np.insert(trajectory.positions, pauses, np.nan, axis=0)
 
 
-def _lines(truth: Trajectory, runs: Sequence[_Run]) -> list[tuple[str, Trajectory, str]]:
-    rows = [("ground truth", truth, "black")]
+def _lines(truth: Trajectory | None, runs: Sequence[_Run]) -> list[tuple[str, Trajectory, str]]:
+    rows = [] if truth is None else [("ground truth", truth, "black")]
     for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
         if run.estimate is not None:
             rows.append((run.label, run.estimate, colour))
     return rows
 
 
-def _plot_paths(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
+def _plot_paths(truth: Trajectory | None, runs: Sequence[_Run]) -> "Figure":
     figure = _figure(11, 5)
     for axes, (i, j) in zip(figure.subplots(1, 2), [(0, 1), (0, 2)], strict=True):
         for label, trajectory, colour in _lines(truth, runs):
@@ -185,9 +224,9 @@ def _plot_paths(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
     return figure
 
 
-def _plot_over_time(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
+def _plot_over_time(truth: Trajectory | None, runs: Sequence[_Run]) -> "Figure":
     figure = _figure(11, 6)
-    start = truth.stamps[0]
+    start = _lines(truth, runs)[0][1].stamps[0]
     rows = figure.subplots(3, 1, sharex=True)
     for k, axes in enumerate(rows):
         for label, trajectory, colour in _lines(truth, runs):

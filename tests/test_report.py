@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cohdc_train.errors import DataError
-from cohdc_train.report import Table, write_report
+from cohdc_train.report import Table, report, write_report
 from cohdc_train.trajectory import Trajectory, score, write_tum
 
 
@@ -125,3 +125,29 @@ def test_what_is_missing_is_named(tmp_path: Path, truth_file: Path) -> None:
 def test_uneven_table_is_refused() -> None:
     with pytest.raises(ValueError, match="2 cells"):
         Table("t", ["a", "b"], [["1"]])
+
+
+def test_the_verb_finds_the_ground_truth_of_the_run_and_compares(tmp_path: Path) -> None:
+    (tmp_path / "sequence").mkdir()
+    write_tum(tmp_path / "sequence" / "groundtruth.txt", trajectory())
+    ours, other = run_folder(tmp_path / "with", 0.001), run_folder(tmp_path / "without", 0.1)
+    (ours / "config.yaml").write_text(f"sequence: {tmp_path / 'sequence'}")
+    assert report(ours, against=other) == ours / "report.html"
+    page = Page((ours / "report.html").read_text())
+    assert {"with", "without, against"} <= set(page.cells)
+    assert "Trajectory against ground truth" in page.heads
+    assert "Absolute trajectory error over time" in page.heads
+
+
+def test_a_run_without_ground_truth_has_its_trajectory_all_the_same(tmp_path: Path) -> None:
+    ours = run_folder(tmp_path / "live", 0.001)
+    (ours / "config.yaml").write_text("sequence: nowhere")
+    page = Page(report(ours, out=tmp_path / "page.html").read_text())
+    assert "Trajectory" in page.heads
+    assert "Absolute trajectory error over time" not in page.heads
+    assert len(page.images) > 2
+
+
+def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"config\.yaml: cannot be read; is .* a folder of cohdc slam"):
+        report(tmp_path)

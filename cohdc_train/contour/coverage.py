@@ -37,7 +37,8 @@ class Coverage:
     def _alone(self) -> NDArray[np.int32]:
         """Rows above less twice the outline's pixels above, per row and column."""
         height, width = self._size
-        return np.repeat(np.arange(height + 1, dtype=np.int32), width) - 2 * self._above
+        alone: NDArray[np.int32] = np.repeat(np.arange(height + 1, dtype=np.int32), width) - 2 * self._above
+        return alone
 
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
         """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has, less a constant: [E]."""
