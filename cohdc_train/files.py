@@ -16,8 +16,12 @@ from cohdc_train.errors import DataError
 def write_bytes(path: Path, content: bytes) -> None:
     """Write to a name beside `path`, then rename: a reader sees the old file or the new one, never a part."""
     temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise DataError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def write_text(path: Path, text: str) -> None:

@@ -83,11 +83,15 @@ def report(run: Path, *, against: Path | None = None, groundtruth: Path | None =
         out: the HTML file; report.html in the run's folder when not given.
     """
     if groundtruth is None:
-        beside = Path(_config(run).get("sequence", "")) / "groundtruth.txt"
+        beside = Path(str(_config(run).get("sequence"))) / "groundtruth.txt"
         groundtruth = beside if beside.is_file() else None
-    runs = {run.name: run} if against is None else {f"{against.name}, against": against, run.name: run}
+        print("ground truth: " + (str(beside) if groundtruth else f"none, {beside} is not there"))
+    name = run.resolve().name
+    runs = {name: run} if against is None else {f"{against.resolve().name}, against": against, name: run}
     page = out if out is not None else run / "report.html"
-    write_report(page, run.name, groundtruth, runs)
+    if page.is_dir():
+        raise DataError(f"{page}: is a folder; --out names the page")
+    write_report(page, name, groundtruth, runs)
     print(page)
     return page
 
@@ -151,8 +155,11 @@ def _load(label: str, folder: Path, truth: Trajectory | None) -> _Run:
     file = folder / "metrics.json"
     try:
         metrics = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{file}: cannot be read as metrics: {error}") from error
+        float(metrics["coverage"])
+        for time in metrics.get("ms", {}).values():
+            float(time["p50"]), float(time["p95"])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise DataError(f"{file}: cannot be read as metrics: {error!r}") from error
     if metrics.get("coverage") == 0:  # a tracker that was never on its way has no pose to plot
         return _Run(label, folder, metrics, None, None)
     estimate = read_tum(folder / "trajectory.txt")

@@ -240,6 +240,24 @@ def test_a_huge_mask_is_traced_and_simplified() -> None:
     assert view.any()
 
 
+def test_a_ring_turned_inside_out_covers_nothing() -> None:
+    mask = np.zeros((4, 4), bool)
+    mask[:, 0] = mask[3] = True
+    coverage = Coverage(trace(mask))
+    (outline,) = trace(mask)
+    assert coverage.iou([outline]) == 1
+    assert coverage.iou([Polygon(outline.outer[::-1])]) == 0
+
+
+@given(SEEDS, st.sampled_from([0.5, 0.8]))
+@settings(max_examples=60, deadline=None)
+def test_the_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
+    """Where a vertex's move may turn a ring over."""
+    mask = blob(seed)[20:36, 30:46]
+    if mask.any():
+        assert iou(rasterize(simplify(trace(mask), floor, "bas_dp"), mask.shape), mask) >= floor
+
+
 def test_an_unknown_method_is_named() -> None:
     with pytest.raises(ValueError, match="contour method 'rdp'; there are bisection, bas_dp, dp, visvalingam"):
         simplify(trace(blob(0)), method="rdp")  # type: ignore[arg-type]
@@ -247,6 +265,5 @@ def test_an_unknown_method_is_named() -> None:
 
 def test_search_parameters_have_the_papers_names() -> None:
     search = BeetleSearch(S=1.0, H=0.5, c=1.0, n=3)
-    assert search.k == 2
     polygons = trace(blob(6))
     assert vertices(simplify(polygons, 0.9, "bas_dp", search=search)) <= vertices(simplify(polygons, 0.9))

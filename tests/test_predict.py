@@ -105,6 +105,9 @@ def test_folder_is_read_in_order_and_overlays_do_not_collide(tmp_path: Path) -> 
     pictures = list(read_pictures(tmp_path))
     assert [one.name for one in pictures] == ["a.jpg", "a.png", "b.png"]
     assert [one.stem for one in pictures] == ["a.jpg", "a.png", "b"]
+    cv2.imwrite(str(tmp_path / "a.jpg.png"), np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "folder.jpg").mkdir()
+    assert len({one.stem for one in read_pictures(tmp_path)}) == 4
 
 
 def test_images_come_as_rgb(tmp_path: Path) -> None:
@@ -148,6 +151,8 @@ def test_a_webcam_is_a_number_and_has_an_end(tmp_path: Path, monkeypatch: pytest
     assert len(list(read_pictures(Path("0")))) == 100
     with pytest.raises(DataError, match=r"webcam7: no picture comes out of it"):
         list(read_pictures(Path("7")))
+    with pytest.raises(DataError, match="no such file"):
+        read_pictures(tmp_path / "12")
     with pytest.raises(DataError, match="frames is 0"):
         read_pictures(Path("0"), 0)
     assert _Webcam.released == 3

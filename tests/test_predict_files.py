@@ -1,6 +1,7 @@
 """The files `cohdc predict` writes, read back by the converters: the same objects, their masks above the floor."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import yaml
 from conversion import converted, iou, masks_of
 from test_predict import Fake, picture
 
-from cohdc_train.predict import predict_pictures
+from cohdc_train.errors import DataError
+from cohdc_train.predict import predict, predict_pictures
 from cohdc_train.predict.pictures import Picture, read_pictures
 
 FLOOR = 0.93
@@ -25,7 +27,7 @@ def photographs(folder: Path) -> list[Picture]:
     return list(read_pictures(folder))
 
 
-def written(folder: Path, pictures: list[Picture], **options: Any) -> dict[str, Any]:
+def written(folder: Path, pictures: Iterable[Picture], **options: Any) -> dict[str, Any]:
     return predict_pictures(pictures, Fake(), folder, iou_floor=FLOOR, **options)
 
 
@@ -65,6 +67,36 @@ def test_a_frame_without_a_file_is_written_beside_its_labelme_file(tmp_path: Pat
     content = json.loads((tmp_path / "walk_000000.json").read_text())
     assert cv2.imread(str(tmp_path / content["imagePath"])).shape == (100, 120, 3)
     assert (tmp_path / "review.txt").read_text() == "no contour to check\n"
+
+
+def test_corrected_labelme_files_are_not_written_over(tmp_path: Path) -> None:
+    pictures = photographs(tmp_path / "photos")
+    written(tmp_path / "out", pictures, format="labelme")
+    (tmp_path / "out" / "b.json").write_text("corrected")
+    with pytest.raises(DataError, match=r"a\.json: is there already, perhaps corrected by hand"):
+        written(tmp_path / "out", pictures, format="labelme")
+    assert (tmp_path / "out" / "b.json").read_text() == "corrected"
+
+
+def test_what_was_found_before_a_broken_image_is_kept(tmp_path: Path) -> None:
+    photographs(tmp_path / "photos")
+    (tmp_path / "photos" / "z.png").write_bytes(b"broken")
+    with pytest.raises(DataError, match=r"z\.png: cannot be decoded"):
+        written(tmp_path / "out", read_pictures(tmp_path / "photos"))
+    assert len(json.loads((tmp_path / "out" / "predictions.json").read_text())["images"]) == 4
+
+
+def test_yolo_refuses_two_pictures_of_one_stem(tmp_path: Path) -> None:
+    photographs(tmp_path / "photos")
+    cv2.imwrite(str(tmp_path / "photos" / "a.jpg"), picture().rgb)
+    with pytest.raises(DataError, match=r"a\.jpg: another image has this stem"):
+        written(tmp_path / "out", read_pictures(tmp_path / "photos"), format="yolo")
+
+
+@pytest.mark.parametrize("option", ["iou_floor", "score", "check_below", "quality"])
+def test_shares_beyond_one_are_refused(tmp_path: Path, option: str) -> None:
+    with pytest.raises(DataError, match=rf"{option} is 95; it must lie within 0\.\.1"):
+        predict(tmp_path, model=Path("person"), out=tmp_path / "out", **{option: 95.0})
 
 
 def test_yolo_labels_come_back_as_the_same_objects(tmp_path: Path) -> None:

@@ -148,6 +148,17 @@ def test_a_run_without_ground_truth_has_its_trajectory_all_the_same(tmp_path: Pa
     assert len(page.images) > 2
 
 
+@pytest.mark.parametrize("metrics", ["{}", "[]", '{"coverage": 1, "ms": [3]}', '{"coverage": 1, "ms": {"track": 3}}'])
+def test_metrics_of_another_kind_are_named(tmp_path: Path, metrics: str) -> None:
+    ours = run_folder(tmp_path / "run", 0.001)
+    (ours / "config.yaml").write_text("sequence: null")
+    (ours / "metrics.json").write_text(metrics)
+    with pytest.raises(DataError, match=r"metrics\.json: cannot be read as metrics"):
+        report(ours)
+    with pytest.raises(DataError, match=r"is a folder; --out names the page"):
+        report(ours, out=tmp_path)
+
+
 def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"config\.yaml: cannot be read; is .* a folder of cohdc slam"):
         report(tmp_path)

@@ -56,7 +56,7 @@ def bench(
         out,
         rows=rows,
         models=models or [],
-        options=_fit_options(fit_config, options or [], epochs, train_minutes),
+        options=() if rows == [] else _fit_options(fit_config, options or [], epochs, train_minutes),
         weights=weights or {},
         seeds=seeds or [0],
         threads=threads,
@@ -71,7 +71,7 @@ def _fit_options(
     from cohdc_train.errors import CohdcError
 
     if (epochs is None) == (train_minutes is None):
-        raise CohdcError(f"a budget is needed: --epochs or --train-minutes, not {'both' if epochs else 'none'}")
+        raise CohdcError(f"a budget is needed: --epochs or --train-minutes, not {'none' if epochs is None else 'both'}")
     given = (f"--config={config}",) if config is not None else ()
     if train_minutes is not None:
         seconds = round(60 * train_minutes)

@@ -79,11 +79,12 @@ def row_config(row: str) -> Path:
         raise CohdcError(f"no row {row!r}; there are {', '.join(ROWS)}, and YAML files of networks") from error
 
 
-def finished_entry(model: Path, data: Path, folder: Path, threads: int, int8: bool) -> Entry:
-    """A checkpoint, exported into a folder, or an ONNX file as it is."""
+def finished_entry(model: Path, data: Path, out: Path, threads: int, int8: bool) -> Entry:
+    """A checkpoint, exported into a folder below `out`, or an ONNX file as it is."""
     model = model_path(model)
     if not model.is_file():
         raise CohdcError(f"{model}: no such file")
+    folder = out / f"model_{model.stem}_{sha256(model)[:8]}"  # most checkpoints are called best.ckpt
     if model.suffix == ".onnx":
         folder.mkdir(parents=True, exist_ok=True)
         files = {"fps_ort": model}
@@ -97,7 +98,8 @@ def _exported(
     file = folder / "model.onnx"
     small = file.with_name("model.int8.onnx")
     digest, kept = sha256(trained.checkpoint), folder / "exported.json"
-    if not (kept.is_file() and json.loads(kept.read_text()) == {"checkpoint": digest, "int8": int8}):
+    there = all(path.is_file() for path in (kept, file, *([small] if int8 else [])))
+    if not (there and json.loads(kept.read_text()) == {"checkpoint": digest, "int8": int8}):
         images = CocoDataModule(data).folder.train[0].images[0].path.parent
         export(trained.checkpoint, file, int8=images if int8 else None, allow_drop=True)
         write_json(kept, {"checkpoint": digest, "int8": int8})

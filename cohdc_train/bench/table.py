@@ -52,6 +52,8 @@ def run(
     int8: bool,
 ) -> list[Row]:
     """`cohdc_train.bench.bench`."""
+    if min(threads, images) < 1:
+        raise CohdcError(f"threads is {threads} and images is {images}; both are at least 1")
     wanted = list(ROWS) if rows is None else rows
     for row in (*wanted, *weights):
         row_config(row)
@@ -70,7 +72,7 @@ def run(
             entries.setdefault(name, []).append(made)
     for model in models:
         print(model, flush=True)
-        entries[str(model)] = [finished_entry(model, data, out / f"model_{model.stem}", threads, int8)]
+        entries[str(model)] = [finished_entry(model, data, out, threads, int8)]
     pictures = _pictures(data, images)
     rates = _timed({name: of_row[0] for name, of_row in entries.items()}, pictures, threads)
     np.save(out / "picture.npy", pictures[0])

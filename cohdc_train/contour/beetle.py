@@ -1,7 +1,7 @@
 """Beetle antennae search over the vertices of an outline (paper 2.1.3, equation 2)."""
 
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +23,9 @@ class BeetleSearch:
         pairs: whiskers of a beetle, in pairs of opposite directions; the paper's has one.
         tries: vertices that are tried before the search ends, those that are missed least first.
         seed: of the random directions.
-        k: parameters of one beetle: 2, a vertex. All the beetles together have the paper's k, twice the vertices.
+
+    The paper's k, the number of parameters, is 2 for every beetle: a vertex. All of them together have twice the
+    vertices.
     """
 
     S: float = 3.0
@@ -33,7 +35,6 @@ class BeetleSearch:
     pairs: int = 4
     tries: int = 2
     seed: int = 0
-    k: int = field(default=2, init=False)
 
 
 def search_vertices(finer: list[Polygon], iou_floor: float, coverage: Coverage, search: BeetleSearch) -> list[Polygon]:

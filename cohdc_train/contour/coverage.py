@@ -74,9 +74,8 @@ class Coverage:
         return self.ratio(*self.sums(polygons))
 
     def ratio(self, covered: int, common: int) -> float:
-        """IoU of two areas, px."""
-        union = self.area + covered - common
-        return common / union if union > 0 else 1.0
+        """IoU of two areas, px; 0 where the rings are turned inside out."""
+        return common / (self.area + covered - common) if covered > 0 else 0.0
 
     def keep(self, polygons: Sequence[Polygon], iou_floor: float) -> bool:
         """Whether polygons whose `iou` keeps the floor do so when they are filled, and no ring crosses another."""

@@ -1,5 +1,6 @@
-"""`cohdc data tum`: a sequence of the TUM RGB-D benchmark, from its publisher or from an archive (no torch)."""
+"""`cohdc data tum`: a sequence of the TUM RGB-D benchmark, from its publisher or from an archive."""
 
+import gzip
 import os
 import tarfile
 import urllib.request
@@ -47,19 +48,25 @@ def tum(
     if folder.is_dir():
         print(f"{folder}: {_check(folder)} images, already there")
         return folder
+    if out.exists() and not out.is_dir():
+        raise DataError(f"{out}: is not a folder")
     out.mkdir(parents=True, exist_ok=True)
-    file = archive
-    if file is None:
-        url = f"{host}/{sequence.partition('_')[0]}/{folder.name}.tgz"
-        file = out / f"{folder.name}.tgz"
-        if not file.is_file():
-            _download(url, file)
-    found = sha256(file)
-    if digest is not None and found != digest.lower():
-        raise DataError(f"{file}: SHA-256 {found}, expected {digest.lower()}")
-    with new_folder(folder) as draft:
-        _unpack(file, folder.name, draft)
-        count = _check(draft, file)
+    fetched = out / f"{folder.name}.tgz"
+    if archive is None and not fetched.is_file():
+        _download(f"{host}/{sequence.partition('_')[0]}/{fetched.name}", fetched)
+    file = fetched if archive is None else archive
+    try:
+        found = sha256(file)
+        if digest is not None and found != digest.lower():
+            raise DataError(f"{file}: SHA-256 {found}, expected {digest.lower()}")
+        with new_folder(folder) as draft:
+            _unpack(file, folder.name, draft)
+            count = _check(draft, file)
+    except DataError as error:
+        if archive is not None:
+            raise
+        fetched.unlink(missing_ok=True)  # so that the next call fetches it again
+        raise DataError(f"{error}; it was deleted") from error
     print(f"{folder}: {count} images, SHA-256 of the archive {found}")
     return folder
 
@@ -79,8 +86,8 @@ def _download(url: str, file: Path) -> None:
     """To FILE.part, from its end on where there is one, renamed when it is whole."""
     part = file.with_name(file.name + ".part")
     have = part.stat().st_size if part.is_file() else 0
-    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
+        request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
         with urllib.request.urlopen(request, timeout=60) as answer:
             if have and answer.status != 206:  # the host gives the whole file again
                 have = 0
@@ -88,7 +95,10 @@ def _download(url: str, file: Path) -> None:
             total = None if length is None else have + int(length)
             with part.open("ab" if have else "wb") as stream:
                 _copy(answer, stream, have, total)
-    except (OSError, HTTPException) as error:
+    except (OSError, HTTPException, ValueError) as error:
+        if getattr(error, "code", None) == 416:  # more than all of it is there: of another file, or not renamed
+            part.unlink()
+            return _download(url, file)
         reason = getattr(error, "reason", None) or error
         raise DataError(
             f"{url}: cannot be fetched: {reason}; fetch it by hand and give --archive FILE, or try again to go on"
@@ -97,6 +107,7 @@ def _download(url: str, file: Path) -> None:
     if total is not None and size != total:
         raise DataError(f"{part}: {size} of {total} bytes arrived; try again to go on")
     os.replace(part, file)
+    return None
 
 
 def _copy(answer: Any, stream: Any, done: int, total: int | None) -> None:
@@ -112,7 +123,7 @@ def _copy(answer: Any, stream: Any, done: int, total: int | None) -> None:
 def _unpack(file: Path, inside: str, target: Path) -> None:
     """Regular files below the folder `inside` of an archive; nothing that leads out of the target, and no links."""
     try:
-        with tarfile.open(file, "r:*") as tar:
+        with tarfile.open(file, "r:gz") as tar:
             for member in tar:
                 path = PurePosixPath(member.name)
                 parts = [part for part in path.parts if part != "."]
@@ -127,8 +138,10 @@ def _unpack(file: Path, inside: str, target: Path) -> None:
                 with source, place.open("wb") as stream:
                     while chunk := source.read(_CHUNK):
                         stream.write(chunk)
-    except (tarfile.TarError, EOFError, OSError, zlib.error) as error:
-        raise DataError(f"{file}: not a whole .tgz: {error}") from error
+    except (tarfile.TarError, EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise DataError(f"{file}: not a whole .tgz: {str(error).partition(chr(10))[0]}") from error
+    except OSError as error:
+        raise DataError(f"{file}: cannot be unpacked into {target.parent}: {error.strerror}") from error
 
 
 def _check(folder: Path, named: Path | None = None) -> int:
@@ -138,11 +151,20 @@ def _check(folder: Path, named: Path | None = None) -> int:
         if not (folder / name).is_file():
             raise DataError(f"{named or folder}: no {name}")
     for name in _LISTS:
-        for number, line in enumerate((folder / name).read_text().splitlines(), start=1):
-            words = line.split("#")[0].split()
-            if not words:
+        for number, line in enumerate(_lines(folder / name, named or folder), start=1):
+            words = line.split()
+            if not words or words[0].startswith("#"):
                 continue
-            if len(words) < 2 or not (folder / words[1]).is_file():
+            if len(words) != 2 or not (folder / words[1]).is_file():
                 raise DataError(f"{named or folder}: {name} line {number}: {' '.join(words)!r} is not there")
             count += 1
+    if not count:
+        raise DataError(f"{named or folder}: its lists name no image")
     return count
+
+
+def _lines(file: Path, named: Path) -> list[str]:
+    try:
+        return file.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise DataError(f"{named}: {file.name} is no text") from error

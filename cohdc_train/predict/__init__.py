@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cohdc_train.contour import Method, simplify, trace
+from cohdc_train.contour import Method, Polygon, simplify, trace
+from cohdc_train.errors import DataError
 from cohdc_train.files import write_bytes
 from cohdc_train.predict.annotation_files import Format, Found, coco, open_format
 from cohdc_train.predict.drawing import draw, jpeg
@@ -44,7 +46,9 @@ def predict(
     file (predictions.json), a labelme file per image, or YOLO-seg labels with their data.yaml. With labelme a person
     corrects contours instead of drawing them: every shape has its score and quality, those to check come first, and
     review.txt lists the images by what is to do. Returns the objects as a COCO dictionary, whatever was written.
-    Raises DataError for images that cannot be read, ContractError for a model that does not keep the contract.
+    Raises DataError for images that cannot be read and for a folder with labelme files, which may be somebody's work;
+    ContractError for a model that does not keep the contract. What was found before an image that cannot be read is
+    written all the same.
 
     Args:
         source: an image, a folder of images, a video, or a webcam's number such as 0.
@@ -53,12 +57,23 @@ def predict(
         score: least class score that is kept.
         quality: least mask quality that is kept; without it nothing is dropped for its quality.
         format: coco, labelme or yolo.
-        contour: how outlines become polygons: bas_dp has the fewest vertices, bisection is the fastest.
+        contour: how outlines become polygons: bas_dp has the fewest vertices, bisection is the fastest; dp has a fixed
+            tolerance of 2 px and knows no floor.
         iou_floor: least IoU of a written polygon with its mask; 1 keeps every pixel.
         check_below: mask quality below which a contour is marked to be checked, in labelme files.
         threads: onnxruntime's threads; 0 leaves it to onnxruntime.
         frames: most pictures that are looked at; when not given all there are, and 100 of a webcam.
     """
+    for name, value in {
+        "score": score,
+        "quality": quality or 0,
+        "iou_floor": iou_floor,
+        "check_below": check_below,
+    }.items():
+        if not 0 <= value <= 1:
+            raise DataError(f"{name} is {value:g}; it must lie within 0..1")
+    if out.exists() and not out.is_dir():
+        raise DataError(f"{out}: is not a folder")
     pictures = read_pictures(source, frames)
     network = Segmenter(model, threads)
     started = time.perf_counter()
@@ -91,16 +106,27 @@ def predict_pictures(
     overlays = out if format == "coco" else out / "overlays"  # apart from a folder that tools take for a data set
     overlays.mkdir(exist_ok=True)
     seen: list[Found] = []
-    for picture in pictures:
-        found = _kept(network(picture.rgb), *least)
-        outlines = [simplify(trace(mask), iou_floor, contour) for mask in found.masks()]
-        found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
-        outlines = [outline for outline in outlines if outline]
-        write_bytes(overlays / f"{picture.stem}_overlay.jpg", jpeg(draw(picture.rgb, found, outlines)))
-        files.picture(picture, one := Found.of(picture, found, outlines))
-        seen.append(one)
+    try:
+        for picture in pictures:
+            found = _kept(network(picture.rgb), *least)
+            outlines = [_outline(mask, iou_floor, contour) for mask in found.masks()]
+            found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
+            outlines = [outline for outline in outlines if outline]
+            write_bytes(overlays / f"{picture.stem}_overlay.jpg", jpeg(draw(picture.rgb, found, outlines)))
+            files.picture(picture, one := Found.of(picture, found, outlines))
+            seen.append(one)
+    except DataError:
+        if seen:
+            files.close(seen)
+        raise
     files.close(seen)
     return coco(seen, network.class_names)
+
+
+def _outline(mask: NDArray[np.bool_], iou_floor: float, contour: Method) -> list[Polygon]:
+    """A mask's polygons; exact ones where a fixed tolerance leaves nothing. Empty for an empty mask."""
+    exact = trace(mask)
+    return simplify(exact, iou_floor, contour) or exact
 
 
 def _kept(found: Detections, score: float, quality: float | None) -> Detections:

@@ -10,6 +10,7 @@ import yaml
 
 from cohdc_train.contour import Polygon, joined
 from cohdc_train.contour.polygons import FloatArray
+from cohdc_train.errors import DataError
 from cohdc_train.files import write_bytes, write_text
 from cohdc_train.predict.drawing import jpeg
 from cohdc_train.predict.pictures import Picture
@@ -123,13 +124,16 @@ class _Labelme:
     def picture(self, picture: Picture, one: Found) -> None:
         path = f"{picture.stem}.jpg"
         if picture.path is not None:
-            path = Path(os.path.relpath(picture.path, self._out)).as_posix()
+            path = Path(os.path.relpath(picture.path.resolve(), self._out.resolve())).as_posix()
         else:
             write_bytes(self._out / path, jpeg(picture.rgb))
         height, width = one.size
+        file = self._out / f"{picture.stem}.json"
+        if file.exists():
+            raise DataError(f"{file}: is there already, perhaps corrected by hand; give a new folder")
         content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
         content |= {"imagePath": path, "imageData": None, "imageHeight": height, "imageWidth": width}
-        write_text(self._out / f"{picture.stem}.json", json.dumps(content, indent=1))
+        write_text(file, json.dumps(content, indent=1))
 
     def _shapes(self, one: Found) -> list[dict[str, Any]]:
         shapes = []
@@ -161,7 +165,8 @@ class _Yolo:
     """labels/<name>.txt per picture and data.yaml: `class x y x y ...`, shares of the picture's width and height.
 
     An object is one line: holes and further parts are joined by bridges of no width. There is no place for score and
-    quality.
+    quality. data.yaml has the names only: for a training, labels/ goes beside the folder images/, and frames of a
+    video are written to images/ here. Labels belong to pictures by their stem, so that no two may have the same.
     """
 
     def __init__(self, out: Path, class_names: tuple[str, ...]) -> None:
@@ -169,6 +174,11 @@ class _Yolo:
         (out / "labels").mkdir(exist_ok=True)
 
     def picture(self, picture: Picture, one: Found) -> None:
+        if picture.path is None:
+            (self._out / "images").mkdir(exist_ok=True)
+            write_bytes(self._out / "images" / picture.name, jpeg(picture.rgb))
+        elif picture.stem != picture.path.stem:
+            raise DataError(f"{picture.path}: another image has this stem, and YOLO labels are found by it")
         height, width = one.size
         lines = []
         for label, outline in zip(one.found.labels.tolist(), one.outlines, strict=True):

@@ -40,14 +40,14 @@ def read_pictures(source: Path, most: int | None = None) -> Iterator[Picture]:
     """
     if most is not None and most < 1:
         raise DataError(f"frames is {most}; at least 1 is needed")
-    if source.name.isdigit() and not source.exists():
-        return islice(_frames(Path(f"webcam{source.name}"), int(source.name)), most or _WEBCAM_FRAMES)
+    if str(source).isdecimal() and not source.exists():
+        return islice(_frames(Path(f"webcam{source}"), int(str(source))), most or _WEBCAM_FRAMES)
     return islice(_stored(source), most)
 
 
 def _stored(source: Path) -> Iterator[Picture]:
     if source.is_dir():
-        files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+        files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file())
         if not files:
             raise DataError(f"{source}: holds no image ({' '.join(sorted(IMAGE_SUFFIXES))})")
         return _images(files)
@@ -59,7 +59,7 @@ def _stored(source: Path) -> Iterator[Picture]:
 
 
 def _images(files: list[Path]) -> Iterator[Picture]:
-    stems = Counter(file.stem for file in files)
+    stems = Counter([file.stem for file in files] + [file.name for file in files])
     for file in files:
         data = np.frombuffer(file.read_bytes(), np.uint8)
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None

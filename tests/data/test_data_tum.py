@@ -53,6 +53,9 @@ class Host(BaseHTTPRequestHandler):
             self.send_error(404)
             return
         first = int(wanted[6:-1]) if wanted and self.ranges else 0
+        if first >= len(self.content):
+            self.send_error(416)
+            return
         self.send_response(206 if first else 200)
         rest = self.content[first:]
         self.send_header("Content-Length", str(len(rest)))
@@ -82,6 +85,20 @@ def test_a_sequence_is_fetched_checked_and_unpacked(tmp_path: Path, host: str, n
     assert {file: (folder / file).read_bytes() for file in FILES} == FILES
     assert tum(name, out=tmp_path / "tum", host=host) == folder
     assert len(Host.asked) == 1, "what is there is not fetched again"
+
+
+def test_a_part_that_is_too_long_is_fetched_anew(tmp_path: Path, host: str) -> None:
+    (tmp_path / f"{NAME}.tgz.part").write_bytes(b"x" * (len(Host.content) + 1))
+    tum("walking_xyz", out=tmp_path, host=host)
+    assert (tmp_path / f"{NAME}.tgz").read_bytes() == Host.content
+
+
+def test_what_the_host_gives_instead_of_an_archive_is_not_kept(tmp_path: Path, host: str) -> None:
+    Host.content = b"<html>please log in</html>"
+    with pytest.raises(DataError, match=r"not a whole \.tgz: not a gzip file; it was deleted") as caught:
+        tum("walking_xyz", out=tmp_path, host=host)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("ranges", [True, False])
@@ -120,6 +137,8 @@ def test_damaged_and_incomplete_archives_leave_nothing(tmp_path: Path) -> None:
     refused(tmp_path, b"no archive", r"given\.tgz: not a whole \.tgz")
     refused(tmp_path, archive({k: v for k, v in FILES.items() if k != "rgb/2.0.png"}), r"rgb\.txt line 3: '2\.0 rgb/2")
     refused(tmp_path, archive({k: v for k, v in FILES.items() if k != "groundtruth.txt"}), r"no groundtruth\.txt")
+    refused(tmp_path, archive(FILES | {"rgb.txt": b"\xff\xfe"}), r"given\.tgz: rgb\.txt is no text")
+    refused(tmp_path, archive(FILES | {"rgb.txt": b"", "depth.txt": b""}), "its lists name no image")
     refused(tmp_path, whole, "SHA-256 [0-9a-f]{64}, expected 00", digest="00")
 
 
