@@ -9,20 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import write_text
+from cohdc_train.report.plots import Run, plot_errors, plot_over_time, plot_paths
 from cohdc_train.trajectory import Trajectory, align_umeyama, match, read_tum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCORES = ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m")
-_COLOURS = ("#c0392b", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")  # of the runs, in their order
-_LOST_AFTER_S = 0.5  # a longer pause between two poses is left open in a plot
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #222 }
 h1, h2, h3 { line-height: 1.2 } table { border-collapse: collapse; margin: .5rem 0 1.5rem }
@@ -54,21 +51,6 @@ class Table:
         return (
             f"<h3>{html.escape(self.title)}</h3>\n<table><thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
         )
-
-
-@dataclass(frozen=True)
-class _Run:
-    """One SLAM run.
-
-    truth, estimate: matched poses, the estimate aligned to the truth; None when too few matched. Without ground truth
-    the estimate stands as it is.
-    """
-
-    label: str
-    folder: Path
-    metrics: dict[str, Any]
-    truth: Trajectory | None
-    estimate: Trajectory | None
 
 
 def report(run: Path, *, against: Path | None = None, groundtruth: Path | None = None, out: Path | None = None) -> Path:
@@ -127,12 +109,12 @@ def write_report(
     if aligned:
         parts.append(f"<h2>Trajectory{'' if truth is None else ' against ground truth'}</h2>")
         how = "" if truth is None else ", after rigid alignment"
-        parts.append(_svg(_plot_paths(truth, aligned), f"seen from above and from the side{how}"))
-        parts.append(_svg(_plot_over_time(truth, aligned), "position over time"))
+        parts.append(_svg(plot_paths(truth, aligned), f"seen from above and from the side{how}"))
+        parts.append(_svg(plot_over_time(truth, aligned), "position over time"))
     if aligned and truth is not None:
         parts.append("<h2>Absolute trajectory error over time</h2>")
         parts.append(
-            _svg(_plot_errors(truth, aligned), "distance to ground truth of every matched pose, after alignment")
+            _svg(plot_errors(truth, aligned), "distance to ground truth of every matched pose, after alignment")
         )
     if overlays:
         parts.append(f"<h2>Predicted masks</h2>\n{_grid([(file, file.stem) for file in overlays])}")
@@ -151,7 +133,7 @@ def _write(out: Path, title: str, parts: Sequence[str]) -> None:
     write_text(out, f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n')
 
 
-def _load(label: str, folder: Path, truth: Trajectory | None) -> _Run:
+def _load(label: str, folder: Path, truth: Trajectory | None) -> Run:
     file = folder / "metrics.json"
     try:
         metrics = json.loads(file.read_text(encoding="utf-8"))
@@ -161,22 +143,22 @@ def _load(label: str, folder: Path, truth: Trajectory | None) -> _Run:
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise DataError(f"{file}: cannot be read as metrics: {error!r}") from error
     if metrics.get("coverage") == 0:  # a tracker that was never on its way has no pose to plot
-        return _Run(label, folder, metrics, None, None)
+        return Run(label, folder, metrics, None, None)
     estimate = read_tum(folder / "trajectory.txt")
     if truth is None:
-        return _Run(label, folder, metrics, None, estimate)
+        return Run(label, folder, metrics, None, estimate)
     try:
         matched_truth, matched = match(truth, estimate)
     except DataError:
-        return _Run(label, folder, metrics, None, None)
+        return Run(label, folder, metrics, None, None)
     T = align_umeyama(matched.positions, matched_truth.positions)
-    return _Run(label, folder, metrics, matched_truth, matched.moved(T))
+    return Run(label, folder, metrics, matched_truth, matched.moved(T))
 
 
 # ---- tables
 
 
-def _metric_tables(runs: Sequence[_Run]) -> list[Table]:
+def _metric_tables(runs: Sequence[Run]) -> list[Table]:
     scored = [(key, run) for key in SCORES for run in runs if key in run.metrics]
     result = []
     if scored:
@@ -193,76 +175,6 @@ def _metric_tables(runs: Sequence[_Run]) -> list[Table]:
     return result
 
 
-# ---- plots
-
-
-def _figure(width: float, height: float) -> "Figure":
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _opened(trajectory: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Stamps [n] and positions [n, 3] with a row of nan wherever tracking paused, so that no line is drawn there."""
-    pauses = np.flatnonzero(np.diff(trajectory.stamps) > _LOST_AFTER_S) + 1
-    stamps = np.insert(trajectory.stamps, pauses, np.nan)
-    return stamps, np.insert(trajectory.positions, pauses, np.nan, axis=0)
-
-
-def _lines(truth: Trajectory | None, runs: Sequence[_Run]) -> list[tuple[str, Trajectory, str]]:
-    rows = [] if truth is None else [("ground truth", truth, "black")]
-    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
-        if run.estimate is not None:
-            rows.append((run.label, run.estimate, colour))
-    return rows
-
-
-def _plot_paths(truth: Trajectory | None, runs: Sequence[_Run]) -> "Figure":
-    figure = _figure(11, 5)
-    for axes, (i, j) in zip(figure.subplots(1, 2), [(0, 1), (0, 2)], strict=True):
-        for label, trajectory, colour in _lines(truth, runs):
-            positions = _opened(trajectory)[1]
-            axes.plot(positions[:, i], positions[:, j], color=colour, linewidth=1.2, label=label)
-        axes.set_xlabel(f"{'xyz'[i]} [m]")
-        axes.set_ylabel(f"{'xyz'[j]} [m]")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.grid(alpha=0.3)
-    axes.legend()
-    return figure
-
-
-def _plot_over_time(truth: Trajectory | None, runs: Sequence[_Run]) -> "Figure":
-    figure = _figure(11, 6)
-    start = _lines(truth, runs)[0][1].stamps[0]
-    rows = figure.subplots(3, 1, sharex=True)
-    for k, axes in enumerate(rows):
-        for label, trajectory, colour in _lines(truth, runs):
-            stamps, positions = _opened(trajectory)
-            axes.plot(stamps - start, positions[:, k], color=colour, linewidth=1.2, label=label)
-        axes.set_ylabel(f"{'xyz'[k]} [m]")
-        axes.grid(alpha=0.3)
-    rows[0].legend(ncols=len(runs) + 1)
-    rows[-1].set_xlabel("time [s]")
-    return figure
-
-
-def _plot_errors(truth: Trajectory, runs: Sequence[_Run]) -> "Figure":
-    figure = _figure(11, 4)
-    axes = figure.subplots()
-    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
-        if run.truth is None or run.estimate is None:
-            continue
-        errors = np.linalg.norm(run.estimate.positions - run.truth.positions, axis=1)
-        label = f"{run.label}: rmse {np.sqrt(np.mean(errors**2)):.4f} m"
-        axes.plot(run.truth.stamps - truth.stamps[0], np.maximum(errors, 1e-5), ".-", color=colour, ms=3, label=label)
-    axes.set_yscale("log")  # a run with masks and one without differ by more than ten
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("error [m]")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
-    return figure
-
-
 def _svg(figure: "Figure", caption: str) -> str:
     import matplotlib
 
@@ -275,7 +187,7 @@ def _svg(figure: "Figure", caption: str) -> str:
 # ---- pictures
 
 
-def _pictures(run: _Run) -> list[tuple[Path, str]]:
+def _pictures(run: Run) -> list[tuple[Path, str]]:
     files = []
     for before in sorted((run.folder / "pictures").glob("*_before.jpg")):
         after = before.with_name(before.name.replace("_before", "_after"))
