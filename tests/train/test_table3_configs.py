@@ -40,13 +40,30 @@ def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
     assert yaml.safe_load(shipped.read_text(encoding="utf-8")) == expected
 
 
-@pytest.mark.parametrize("name", ["person.yaml", *(f"table3/test{test:02d}.yaml" for test in TABLE)])
+NETWORKS = [f"networks/{path.name}" for path in sorted(config_path("networks/resnet50.yaml").parent.iterdir())]
+
+
+def holds(resolved: Any, given: Any) -> bool:
+    """Whether every value that a file gives stands in the resolved configuration."""
+    if not isinstance(given, dict):
+        return bool(resolved == given)
+    return all(name in resolved and holds(resolved[name], value) for name, value in given.items())
+
+
+@pytest.mark.parametrize(
+    "name", ["person.yaml", "table4.yaml", *NETWORKS, *(f"table3/test{i:02d}.yaml" for i in TABLE)]
+)
 def test_a_configuration_parses_and_resolves(name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         fit(["--config", name, f"--data.root={tmp_path}", "--print_config"])
     assert stop.value.code == 0
     given = yaml.safe_load(config_path(name).read_text(encoding="utf-8"))
-    resolved = yaml.safe_load(capsys.readouterr().out)
-    assert resolved["data"]["canvas"] == given["data"]["canvas"]
-    assert resolved["model"]["network"]["anchor_scales"] == given["model"]["network"]["anchor_scales"]
-    assert resolved["trainer"]["max_epochs"] == given["trainer"]["max_epochs"]
+    assert holds(yaml.safe_load(capsys.readouterr().out), given)
+
+
+def test_a_network_and_a_recipe_add_up(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        both = ["--config=networks/hdc_net_n.yaml", "--config", "person.yaml"]
+        fit([*both, f"--data.root={tmp_path}", "--print_config"])
+    network = yaml.safe_load(capsys.readouterr().out)["model"]["network"]
+    assert (network["backbone"], network["fpn_channels"], network["norm"]) == ("mobilenet_v2", 64, "frozen")
