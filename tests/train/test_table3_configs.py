@@ -62,8 +62,8 @@ def test_a_configuration_parses_and_resolves(name: str, capsys: pytest.CaptureFi
 
 
 def test_a_network_and_a_recipe_add_up(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    both = ["--config=networks/hdc_net_n.yaml", "--config", "person.yaml"]
     with pytest.raises(SystemExit):
-        both = ["--config=networks/hdc_net_n.yaml", "--config", "person.yaml"]
         fit([*both, f"--data.root={tmp_path}", "--print_config"])
     network = yaml.safe_load(capsys.readouterr().out)["model"]["network"]
     assert (network["backbone"], network["fpn_channels"], network["norm"]) == ("mobilenet_v2", 64, "frozen")
