@@ -240,7 +240,7 @@ def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
         assert [row["name"] for row in csv.DictReader(stream)] == [row["name"] for row in table]
     assert (tmp_path / "out" / "table4.png").read_bytes().startswith(b"\x89PNG")
     before = {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")}
-    ours = tmp_path / "out" / "ResNet50_seed0" / "model.onnx"
+    ours = tmp_path / "out" / "resnet50_seed0" / "model.onnx"
     again = bench(data, out=tmp_path / "out", models=[ours], **asked)
     assert {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")} == before
     assert again[2]["ap"] == again[0]["ap"]
