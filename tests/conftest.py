@@ -2,8 +2,12 @@
 
 import pytest
 import torch
+from hypothesis import settings
 
 from cohdc_train.models import MaskRCNN, NetworkConfig
+
+settings.register_profile("patient", deadline=None)  # a busy machine is no failure
+settings.load_profile("patient")
 
 SMALL = NetworkConfig(
     depth=18,
