@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.contour.polygons import FloatArray, IntArray, Polygon, crossings, rasterize
+from cohdc_train.contour.polygons import FloatArray, IntArray, Polygon, crossings, edges, rasterize
 
 GRID = 0.2  # px, between places for a vertex: one decimal in a file, and the grid that COCO's tools fill on
 
@@ -50,8 +50,7 @@ class Coverage:
         rings = [ring for polygon in polygons for ring in polygon.rings]
         if not rings:
             return 0, 0
-        end = np.concatenate([np.concatenate([ring[1:], ring[:1]]) for ring in rings])
-        return self.between(np.concatenate(rings), end)
+        return self.between(*edges(rings))
 
     def between(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
         """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
@@ -100,8 +99,7 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
     """Whether two edges cross, of one ring or of two; rings that only touch do not."""
     if not rings:
         return False
-    start = np.concatenate(rings)
-    end = np.concatenate([np.concatenate([ring[1:], ring[:1]]) for ring in rings])
+    start, end = edges(rings)
     low, high = np.minimum(start, end), np.maximum(start, end)
     rows = max(1, _MOST_PAIRS // len(start))
     for first in range(0, len(start), rows):

@@ -72,12 +72,16 @@ def _fill(rings: Sequence[FloatArray], size: tuple[int, int]) -> NDArray[np.bool
     height, width = size
     if not rings:
         return np.zeros(size, np.bool_)
-    start = np.concatenate(rings)
-    end = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
+    start, end = edges(rings)
     _, row, column, _ = crossings(start, end, size)
     hits = np.bincount(row * width + column, minlength=(height + 1) * width).reshape(height + 1, width)
     odd = np.bitwise_xor.accumulate(hits[:height].astype(np.uint8), axis=0) & 1
     return odd.view(np.bool_)
+
+
+def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Where the edges of all rings begin and end: two [E, 2], px. There is a ring at least."""
+    return np.concatenate(rings), np.concatenate([part for ring in rings for part in (ring[1:], ring[:1])])
 
 
 def crossings(

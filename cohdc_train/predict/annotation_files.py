@@ -122,15 +122,15 @@ class _Labelme:
         self._out, self._names, self._check = out, class_names, check_below
 
     def picture(self, picture: Picture, one: Found) -> None:
+        file = self._out / f"{picture.stem}.json"
+        if file.exists():
+            raise DataError(f"{file}: is there already, perhaps corrected by hand; give a new folder")
         path = f"{picture.stem}.jpg"
         if picture.path is not None:
             path = Path(os.path.relpath(picture.path.resolve(), self._out.resolve())).as_posix()
         else:
             write_bytes(self._out / path, jpeg(picture.rgb))
         height, width = one.size
-        file = self._out / f"{picture.stem}.json"
-        if file.exists():
-            raise DataError(f"{file}: is there already, perhaps corrected by hand; give a new folder")
         content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
         content |= {"imagePath": path, "imageData": None, "imageHeight": height, "imageWidth": width}
         write_text(file, json.dumps(content, indent=1))
