@@ -33,7 +33,7 @@ def simplify(
     rest by beetle antennae search (the paper's equation 2), and keeps the finer polygon when the floor cannot be
     reached. `dp` is plain Douglas-Peucker with a fixed tolerance, which knows no floor.
 
-    Rings of a result do not cross themselves or each other within a part; where a coarser one would, the finer one
+    But for `dp`, rings of a result do not cross themselves or each other; where a coarser one would, the finer one
     stays. Parts and holes too small to keep three vertices vanish where the floor allows it.
 
     Args:

@@ -117,10 +117,10 @@ def predict_pictures(
             seen.append(one)
     except DataError:
         if seen:
-            files.close(seen)
+            files.close(seen, coco(seen, network.class_names))
         raise
-    files.close(seen)
-    return coco(seen, network.class_names)
+    files.close(seen, content := coco(seen, network.class_names))
+    return content
 
 
 def _outline(mask: NDArray[np.bool_], iou_floor: float, contour: Method) -> list[Polygon]:

@@ -43,15 +43,15 @@ class Files(Protocol):
     def picture(self, picture: Picture, one: Found, /) -> None:
         """What belongs to one picture."""
 
-    def close(self, seen: Sequence[Found], /) -> None:
-        """What belongs to all of them."""
+    def close(self, seen: Sequence[Found], content: dict[str, Any], /) -> None:
+        """What belongs to all of them; content: their COCO dictionary."""
 
 
 def open_format(format: Format, out: Path, class_names: tuple[str, ...], check_below: float) -> Files:
     """The writer of a format into a folder. check_below: quality below which labelme shapes are marked."""
     if format == "labelme":
         return _Labelme(out, class_names, check_below)
-    return _Yolo(out, class_names) if format == "yolo" else _Coco(out, class_names)
+    return _Yolo(out, class_names) if format == "yolo" else _Coco(out)
 
 
 def coco(seen: Sequence[Found], class_names: Sequence[str]) -> dict[str, Any]:
@@ -101,14 +101,14 @@ def _numbers(ring: FloatArray) -> list[float]:
 class _Coco:
     """predictions.json."""
 
-    def __init__(self, out: Path, class_names: tuple[str, ...]) -> None:
-        self._out, self._names = out, class_names
+    def __init__(self, out: Path) -> None:
+        self._out = out
 
     def picture(self, picture: Picture, one: Found) -> None:
         return
 
-    def close(self, seen: Sequence[Found]) -> None:
-        write_text(self._out / "predictions.json", json.dumps(coco(seen, self._names), separators=(",", ":")))
+    def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
+        write_text(self._out / "predictions.json", json.dumps(content, separators=(",", ":")))
 
 
 class _Labelme:
@@ -150,7 +150,7 @@ class _Labelme:
                 shapes.append(shape)
         return shapes
 
-    def close(self, seen: Sequence[Found]) -> None:
+    def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
         todo = [(int((one.found.quality < self._check).sum()), one) for one in seen]
         lines = [
             f"{one.name}: {count} of {len(one.outlines)} contours to check, the worst of quality "
@@ -186,5 +186,5 @@ class _Yolo:
             lines.append(" ".join([str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]))
         write_text(self._out / "labels" / f"{picture.stem}.txt", "".join(f"{line}\n" for line in lines))
 
-    def close(self, seen: Sequence[Found]) -> None:
+    def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
         write_text(self._out / "data.yaml", yaml.safe_dump({"names": dict(enumerate(self._names))}, sort_keys=False))
