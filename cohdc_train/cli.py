@@ -107,10 +107,13 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
     switches: set[str] = set()
 
     class Parser(ArgumentParser):
-        """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`."""
+        """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`.
+
+        One inside a group does: `--method.loops false`; jsonargparse copies this method for groups, without its scope.
+        """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
-            if kwargs.get("type") is bool and names[0].startswith("--"):
+            if kwargs.get("type") is bool and names[0].startswith("--") and "." not in names[0]:
                 switches.add(names[0])
                 del kwargs["type"]
                 kwargs |= {"action": ActionYesNo, "nargs": "?"}

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.tum import Frame, read_mask
+from cohdc_train.slam.source import View
+from cohdc_train.slam.tum import read_mask
 
 Mask = NDArray[np.bool_]
-MaskSource = Callable[[Frame, NDArray[np.uint8]], Mask | None]
+MaskSource = Callable[[View], Mask | None]
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Cullin
     return union
 
 
-def no_masks(frame: Frame, rgb: NDArray[np.uint8]) -> Mask | None:
+def no_masks(view: View) -> Mask | None:
     """The source for a world that stands still."""
     return None
 
@@ -89,9 +90,9 @@ class FolderMasks:
             raise DataError(f"{folder}: no such folder of masks")
         self._folder, self._camera, self._culling = folder, camera, culling
 
-    def __call__(self, frame: Frame, rgb: NDArray[np.uint8]) -> Mask:
+    def __call__(self, view: View) -> Mask:
         """[H, W] bool. Raises DataError when the frame's mask is missing: a missed person would spoil the map."""
-        mask = read_mask(self._folder / f"{frame.rgb.stem}.png", self._camera)
+        mask = read_mask(self._folder / f"{view.name}.png", self._camera)
         return grow(mask, self._culling.dilate)
 
 
@@ -107,6 +108,6 @@ class ModelMasks:
         self._labels = frozenset(names.index(name) for name in wanted)
         self._segmenter, self._culling = segmenter, culling
 
-    def __call__(self, frame: Frame, rgb: NDArray[np.uint8]) -> Mask:
+    def __call__(self, view: View) -> Mask:
         """[H, W] bool."""
-        return dynamic_mask(self._segmenter(rgb), self._labels, self._culling)
+        return dynamic_mask(self._segmenter(view.rgb), self._labels, self._culling)

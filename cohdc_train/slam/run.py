@@ -17,6 +17,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera, choose_camera
 from cohdc_train.slam.culling import Culling, FolderMasks, MaskSource, ModelMasks, no_masks
 from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.method import Method
 from cohdc_train.slam.results import (
     FrameRecord,
     check_out,
@@ -27,8 +28,8 @@ from cohdc_train.slam.results import (
     write_jpeg,
     write_run,
 )
+from cohdc_train.slam.source import Recorded, Source, View
 from cohdc_train.slam.tracking import Tracker
-from cohdc_train.slam.tum import Frame, Sequence, read_depth, read_rgb, read_sequence
 from cohdc_train.trajectory import Trajectory
 
 _PICTURES = 6
@@ -44,6 +45,7 @@ def slam(
     seed: int = 0,
     features: int = 1000,
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
+    method: Method = Method(),  # noqa: B008 - the same
 ) -> dict[str, Any]:
     """Track an RGB-D camera through a TUM-format sequence; people are removed when masks or a model are given.
 
@@ -59,6 +61,7 @@ def slam(
         seed: of the random samples; the same seed gives the same numbers.
         features: corners per frame.
         culling: how masks are made.
+        method: which parts of the method run.
     """
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
@@ -66,23 +69,26 @@ def slam(
         raise DataError(f"{sequence}: no such folder")
     check_out(out)
     intrinsics, origin = choose_camera(sequence, camera)
-    pairs = read_sequence(sequence)
-    source = _mask_source(model, masks, intrinsics, culling)
+    source = Recorded(sequence, intrinsics)
+    mask_of = _mask_source(model, masks, intrinsics, culling)
     print(f"camera: {origin}")
-    print(
-        f"sequence: {len(pairs.frames)} pairs; {pairs.without_depth} colour images have no depth image and are left out"
-    )
+    print(f"sequence: {len(source)} pairs; {source.without_depth} colour images have no depth image and are left out")
     options = {"model": model, "masks": masks, "sequence": sequence, "seed": seed, "features": features}
     config: dict[str, Any] = {key: str(v) if isinstance(v, Path) else v for key, v in options.items()}
-    config |= {"culling": asdict(culling), "camera": intrinsics.as_dict(), "camera_origin": origin}
+    config |= {
+        "culling": asdict(culling),
+        "method": asdict(method),
+        "camera": intrinsics.as_dict(),
+        "camera_origin": origin,
+    }
     config |= {"version": __version__}
     with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         part = Path(folder)
-        tracker = Tracker(intrinsics, features, seed)
-        records = _run(tracker, pairs, source, part)
+        tracker = Tracker(intrinsics, features, seed, method)
+        records = _run(tracker, source, mask_of, part)
         trajectory = Trajectory(*tracker.trajectory())
-        metrics = {"seed": seed, "without_depth": pairs.without_depth}
-        metrics |= measure(records, trajectory, pairs.groundtruth)
+        metrics = {"seed": seed, "without_depth": source.without_depth}
+        metrics |= measure(records, trajectory, source.groundtruth)
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
     print(summary(metrics))
@@ -114,30 +120,29 @@ def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling
     return ModelMasks(Segmenter(model), culling)
 
 
-def _run(tracker: Tracker, sequence: Sequence, source: MaskSource, part: Path) -> list[FrameRecord]:
+def _run(tracker: Tracker, source: Source, mask_of: MaskSource, part: Path) -> list[FrameRecord]:
     (part / "pictures").mkdir()
-    count = len(sequence.frames)
+    count = len(source)
     pictured = set(np.linspace(0, count - 1, min(_PICTURES, count)).round().astype(int).tolist())
     records = []
-    for index, frame in enumerate(sequence.frames):
-        records.append(_step(tracker, frame, source, part / "pictures" if index in pictured else None))
+    for index, view in enumerate(source):
+        records.append(_step(tracker, view, mask_of, part / "pictures" if index in pictured else None))
         _progress(index + 1, count, records[-1])
     return records
 
 
-def _step(tracker: Tracker, frame: Frame, source: MaskSource, pictures: Path | None) -> FrameRecord:
+def _step(tracker: Tracker, view: View, mask_of: MaskSource, pictures: Path | None) -> FrameRecord:
     """One frame; when it is to be pictured, the drawing stays outside the measured time."""
-    rgb, depth = read_rgb(frame.rgb, tracker.camera), read_depth(frame.depth, tracker.camera)
     start = time.perf_counter()
-    mask = source(frame, rgb)
+    mask = mask_of(view)
     segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
-    pose = tracker.track(rgb, depth, frame.t, mask)
+    pose = tracker.track(view.rgb, view.depth, view.t, mask)
     if pictures is not None and tracker.features is not None:
-        unmasked = FeatureExtractor(tracker.camera, tracker.budget)(rgb, depth)
-        write_jpeg(pictures / f"{frame.stamp}_before.jpg", draw_before(rgb, unmasked, mask))
+        unmasked = FeatureExtractor(tracker.camera, tracker.budget)(view.rgb, view.depth)
+        write_jpeg(pictures / f"{view.stamp}_before.jpg", draw_before(view.rgb, unmasked, mask))
         if mask is not None:
-            write_jpeg(pictures / f"{frame.stamp}_after.jpg", draw_after(rgb, tracker.features, mask))
-    return FrameRecord(frame.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms)
+            write_jpeg(pictures / f"{view.stamp}_after.jpg", draw_after(view.rgb, tracker.features, mask))
+    return FrameRecord(view.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms)
 
 
 def _progress(done: int, count: int, record: FrameRecord) -> None:

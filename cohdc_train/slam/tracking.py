@@ -12,6 +12,7 @@ from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
+from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, Weighing, optimize_pose
 from cohdc_train.slam.ransac import ransac_pose
 
@@ -51,8 +52,9 @@ class _Fit:
 class Tracker:
     """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit."""
 
-    def __init__(self, camera: Camera, features: int = 1000, seed: int = 0) -> None:
+    def __init__(self, camera: Camera, features: int = 1000, seed: int = 0, method: Method | None = None) -> None:
         self.camera = camera
+        self.method = method or Method()
         self.map = Map(camera)
         self.budget = features
         self.features: Features | None = None  # of the latest frame

@@ -17,7 +17,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
 from cohdc_train.slam.culling import Culling, ModelMasks
 from cohdc_train.slam.run import slam
-from cohdc_train.slam.tum import Frame
+from cohdc_train.slam.source import View
 from cohdc_train.trajectory import read_tum
 
 SIX = {"rmse", "mean", "median", "std", "min", "max"}
@@ -150,13 +150,12 @@ class TwoClasses:
         return Detections(box, np.zeros(1, dtype=np.int64), one, one, mask, (height, width), self.class_names)
 
 
-def test_a_model_masks_the_classes_that_are_asked_for(tmp_path: Path) -> None:
-    frame = Frame(0.0, "0", tmp_path, tmp_path)
-    rgb = np.zeros((240, 320, 3), dtype=np.uint8)
+def test_a_model_masks_the_classes_that_are_asked_for() -> None:
+    view = View(0.0, "0", "0", np.zeros((240, 320, 3), dtype=np.uint8), np.zeros((240, 320), dtype=np.float32))
     model = TwoClasses()
-    assert ModelMasks(model, Culling(dilate=0))(frame, rgb).mean() == 0.5  # type: ignore[arg-type]
+    assert ModelMasks(model, Culling(dilate=0))(view).mean() == 0.5  # type: ignore[arg-type]
     chairs = ModelMasks(model, Culling(dynamic_classes=["chair"]))  # type: ignore[arg-type]
-    assert not chairs(frame, rgb).any()
+    assert not chairs(view).any()
     with pytest.raises(DataError, match="'dog' is not one of the model's: person, chair"):
         ModelMasks(model, Culling(dynamic_classes=["dog"]))  # type: ignore[arg-type]
 
