@@ -71,6 +71,8 @@ def moving_group(T_cw: Array, points: Array, seen: Observations, weighing: Weigh
     for group, step, covariance in zip(groups, steps, covariances, strict=True):
         by_pose = J[group]
         off = error[group] + by_pose @ step
+        if np.median(np.einsum("mi,mi->m", off, off)) <= _LIMIT:  # the pose's uncertainty only makes less of it
+            continue
         spread = np.eye(3) + by_pose @ covariance @ by_pose.transpose(0, 2, 1)
         squares = np.einsum("mi,mi->m", off, np.linalg.solve(spread, off[..., None])[..., 0])
         excess = float(np.median(squares)) / _LIMIT

@@ -17,6 +17,7 @@ from cohdc_train.slam.matching import Matches, match_descriptors, match_projecte
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, log_se3, optimize_pose
 from cohdc_train.slam.ransac import ransac_pose
+from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.rigidity import pose_of_rest
 
 _MIN_START = 50  # points a first keyframe needs
@@ -67,6 +68,7 @@ class Tracker:
         self.mask: NDArray[np.bool_] | None = None  # what was left out of it: as given, and what geometry found
         self._extract = FeatureExtractor(camera, features)
         self._geometry = Geometry(camera)
+        self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera)
         self._rng = np.random.default_rng(seed)
         self._velocity = np.eye(4)
@@ -103,7 +105,7 @@ class Tracker:
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
         if fit is not None and keyframe:
-            fit = self._add_keyframe(features, fit, t, (thumbnail(rgb), self._geometry.nearest(depth_m)))
+            fit = self._add_keyframe(features, fit, t, rgb, depth_m)
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
@@ -223,12 +225,18 @@ class Tracker:
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
     def _add_keyframe(
-        self, features: Features, fit: _Fit, t: float, pictures: tuple[NDArray[np.float32], NDArray[np.float32]]
+        self, features: Features, fit: _Fit, t: float, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
     ) -> _Fit:
+        pyramid = Pyramid(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)) if self._refiner else None
+        if self._refiner is not None and pyramid is not None:
+            features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
+        pictures = thumbnail(rgb), self._geometry.nearest(depth_m)
         keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, *pictures)
         insert_keyframe(self.map, keyframe, self._weighing)
+        if self._refiner is not None and pyramid is not None:
+            self._refiner.remember(keyframe, pyramid)
         self._reference = keyframe
         self._since_keyframe = 0
         self._reference_inliers = 0
