@@ -78,7 +78,7 @@ def _problem(world: Map, window: list[Keyframe], fixed: int) -> tuple[Problem, N
     row = np.full(world.size + 1, -1)
     row[ids] = np.arange(len(ids))
     corners = [np.flatnonzero(row[k.point_ids] >= 0) for k in window]
-    seen = [observations(k.features, c) for k, c in zip(window, corners, strict=True)]
+    seen = [observations(k.features, c, world.trust(k.point_ids[c])) for k, c in zip(window, corners, strict=True)]
     problem = Problem(
         cameras=np.repeat(np.arange(len(window)), [len(c) for c in corners]),
         points=np.concatenate([row[k.point_ids[c]] for k, c in zip(window, corners, strict=True)]),

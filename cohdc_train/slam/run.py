@@ -136,7 +136,8 @@ def _step(tracker: Tracker, view: View, mask_of: MaskSource, pictures: Path | No
     start = time.perf_counter()
     mask = mask_of(view)
     segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
-    pose = tracker.track(view.rgb, view.depth, view.t, mask)
+    pose = tracker.track(view.rgb, view.depth, view.t, mask, view.depth_t)
+    mask = tracker.mask
     if pictures is not None and tracker.features is not None:
         unmasked = FeatureExtractor(tracker.camera, tracker.budget)(view.rgb, view.depth)
         write_jpeg(pictures / f"{view.stamp}_before.jpg", draw_before(view.rgb, unmasked, mask))
