@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.optimization import Array, exp_se3, to_local
-from cohdc_train.slam.pose_graph import inverse
+from cohdc_train.slam.optimization import Array, exp_se3, inverse, to_local
 
 _SIDE = 160  # px of a picture's longer side
 _LEVELS = 2

@@ -7,8 +7,8 @@ from scipy import sparse
 from cohdc_train.slam.alignment import Picture
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.mapping import adjust_window, fuse_into
-from cohdc_train.slam.optimization import Weighing
-from cohdc_train.slam.pose_graph import Edges, inverse, optimize_graph
+from cohdc_train.slam.optimization import Weighing, inverse
+from cohdc_train.slam.pose_graph import Edges, optimize_graph
 from cohdc_train.slam.recognition import Places
 from cohdc_train.slam.verification import Loop, Verifier
 

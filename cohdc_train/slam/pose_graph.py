@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from cohdc_train.slam.optimization import Array, exp_se3, skew
+from cohdc_train.slam.optimization import Array, exp_se3, inverse, skew
 
 _ROUNDS = 6  # in which the kernel narrows
 _STEPS = 4  # per round
@@ -47,17 +47,8 @@ def log_se3(T: Array) -> Array:
     angle = np.linalg.norm(phi, axis=1)[:, None, None]
     half = np.maximum(angle / 2, 1e-9)
     c = np.where(angle < 1e-3, 1 / 12, (1 - half / np.tan(half)) / np.maximum(angle, 1e-9) ** 2)
-    inverse = np.eye(3) - 0.5 * cross + c * cross @ cross
-    return np.concatenate([(inverse @ T[:, :3, 3:])[..., 0], phi], axis=1)
-
-
-def inverse(T: Array) -> Array:
-    """T: [..., 4, 4] rigid. Returns [..., 4, 4]."""
-    result = np.zeros_like(T)
-    result[..., :3, :3] = T[..., :3, :3].swapaxes(-1, -2)
-    result[..., :3, 3:] = -result[..., :3, :3] @ T[..., :3, 3:]
-    result[..., 3, 3] = 1.0
-    return result
+    left = np.eye(3) - 0.5 * cross + c * cross @ cross
+    return np.concatenate([(left @ T[:, :3, 3:])[..., 0], phi], axis=1)
 
 
 def edge_errors(poses: Array, edges: Edges) -> Array:

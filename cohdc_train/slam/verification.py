@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from cohdc_train.slam.alignment import Picture, align
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
-from cohdc_train.slam.optimization import Array, Weighing, optimize_pose
-from cohdc_train.slam.pose_graph import inverse
+from cohdc_train.slam.optimization import Array, Weighing, inverse, optimize_pose
 from cohdc_train.slam.ransac import ransac_pose
 
 _PLACE = 8  # keyframes around the old one whose points make up the place
