@@ -15,7 +15,7 @@ from cohdc_train.slam.verification import Loop, Verifier
 _RECENT = 10  # keyframes that cannot be a loop with the newest
 _COVISIBLE = 15  # shared points make neighbours, and neighbours are no loop
 _CANDIDATES = 2  # checked per keyframe
-_LIKENESS = 0.4  # of the likeness of the keyframe's neighbours, which an old keyframe must reach
+_LIKENESS = 0.7  # of the likeness of the keyframe's neighbours, which an old keyframe must reach
 _APART = 5  # keyframes between two candidates: nearer ones are the same place
 _FUSE = 6  # keyframes on each side whose points are made one
 _STRONG = 3  # older neighbours of a keyframe that the graph knows besides the one before it

@@ -38,5 +38,5 @@ def way_round(frames: int, turns: float = 1.1) -> NDArray[np.float64]:
 def poor_view(T_wc: NDArray[np.float64], rng: np.random.Generator) -> View:
     """What a noisy sensor gives of the hall: 5 grey levels, and 3 mm of depth at 1 m, growing with its square."""
     rgb, depth, _ = render(hall(), T_wc, CAMERA)
-    noisy = np.clip(rgb + rng.normal(0, 5, rgb.shape), 0, 255).astype(np.uint8)
-    return noisy, (depth + rng.normal(size=depth.shape) * 0.003 * depth**2).astype(np.float32)
+    noisy = np.clip(rgb + 5 * rng.standard_normal(rgb.shape, dtype=np.float32), 0, 255).astype(np.uint8)
+    return noisy, depth + 0.003 * depth**2 * rng.standard_normal(depth.shape, dtype=np.float32)
