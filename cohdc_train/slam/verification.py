@@ -19,7 +19,8 @@ _NEIGHBOURS = 4
 _MIN_AGREE = 2  # of them
 _AGREE_M = 0.03
 _AGREE_RAD = 0.02
-_MIN_CORRELATION = 0.6
+_NO_WORSE = 1.02  # times the photometric error before
+_MIN_CORRELATION = 0.75
 _MIN_OVERLAP = 0.2
 _MIN_AGREEMENT = 0.7
 _REFINED_M = 0.05  # the pictures may move the points' answer this far
@@ -103,7 +104,7 @@ class Verifier:
     def _align(self, T: Array, of_map: Picture, local: Picture) -> Array | None:
         """T refined by the pictures, if they confirm it (paper 2.3, equations 10 to 12)."""
         found = align(of_map, local, T)
-        if found is None or found.after > found.before:
+        if found is None or found.after > _NO_WORSE * found.before:
             return None
         sure = found.correlation >= _MIN_CORRELATION
         sure &= found.overlap >= _MIN_OVERLAP and found.agreement >= _MIN_AGREEMENT
