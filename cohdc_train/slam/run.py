@@ -87,7 +87,7 @@ def slam(
         tracker = Tracker(intrinsics, features, seed, method)
         records = _run(tracker, source, mask_of, part)
         trajectory = Trajectory(*tracker.trajectory())
-        metrics = {"seed": seed, "without_depth": source.without_depth}
+        metrics = {"seed": seed, "without_depth": source.without_depth, "loops": tracker.loops}
         metrics |= measure(records, trajectory, source.groundtruth)
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
@@ -101,6 +101,7 @@ def summary(metrics: dict[str, Any]) -> str:
     rows = [
         ("frames", f"{metrics['tracked']} of {metrics['frames']} tracked ({100 * metrics['coverage']:.1f} %)"),
         ("keyframes", str(metrics["keyframes"])),
+        ("loops closed", str(metrics["loops"])),
         ("frames/s", f"{metrics['fps']:.1f}"),
     ]
     rows += [(f"{stage} ms", f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for stage, q in metrics["ms"].items()]

@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.culling import grow
 from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.loop_closing import LoopCloser
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
@@ -71,6 +73,7 @@ class Tracker:
         self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera)
         self._rng = np.random.default_rng(seed)
+        self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._velocity = np.eye(4)
         self._last: _Fit | None = None
         self._reference: Keyframe | None = None
@@ -106,11 +109,18 @@ class Tracker:
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
         if fit is not None and keyframe:
             fit = self._add_keyframe(features, fit, t, rgb, depth_m)
+            if self._loops is not None:
+                fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
         T_wc = None if fit is None else np.linalg.inv(fit.T_cw).astype(np.float64)
         return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
+
+    @property
+    def loops(self) -> int:
+        """How many loops were closed."""
+        return 0 if self._loops is None else self._loops.closed
 
     def trajectory(self) -> tuple[Array, Array]:
         """All tracked frames, each re-derived from its reference keyframe as the map has it now.
@@ -240,8 +250,17 @@ class Tracker:
         self._reference = keyframe
         self._since_keyframe = 0
         self._reference_inliers = 0
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
-        return _Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners))
+        return _fit_of(keyframe)
+
+    def _close_loop(self, fit: _Fit, loops: LoopCloser, picture: Picture) -> _Fit:
+        """The newest keyframe's fit; after a loop the last frame's pose goes along, so that the velocity stays."""
+        keyframe = self.map.keyframes[-1]
+        if not loops.close(keyframe, picture):
+            return fit
+        if self._last is not None:
+            moved = self._last.T_cw @ np.linalg.inv(fit.T_cw) @ keyframe.T_cw
+            self._last = _Fit(moved, self._last.matches)
+        return _fit_of(keyframe)
 
     def _remember(self, fit: _Fit | None, t: float) -> None:
         if fit is None or self._reference is None:
@@ -254,6 +273,11 @@ class Tracker:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
         self._log.append((t, self._reference, fit.T_cw @ np.linalg.inv(self._reference.T_cw)))
+
+
+def _fit_of(keyframe: Keyframe) -> _Fit:
+    corners = np.flatnonzero(keyframe.point_ids >= 0)
+    return _Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners))
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
