@@ -22,13 +22,16 @@ _FAR = 5.0  # m: a Kinect errs by 4 cm and more beyond
 _EDGE = 0.04  # of the depth: a larger step within two pixels is an edge, where near and far mix
 _MASK_BAND = 0.01  # of the image's width by which a mask grows once more: depth images smear outlines
 _UNITS = 10_000.0  # per m, in the file of kept depth images
+_FARTHEST = 6.5  # m: what those can hold
 _NOISE = 0.03, 0.01  # m and m / m^2: a depth z is held to be within a + b z^2 of a surface it shows
+
+_DOUBT = 2  # a view through a point outweighs so many that show it
 
 Frame = tuple[float, NDArray[np.uint8], NDArray[np.float32]]
 
 
 class KeyframeImages:
-    """Watches a run and keeps colour and static depth of its keyframes in a nameless file on disk (some 300 kB each).
+    """Watches a run and keeps colour and unmasked depth of its keyframes in a nameless file on disk (some 300 kB each).
 
     folder: where that file lies; it vanishes with `close`.
     """
@@ -51,7 +54,7 @@ class KeyframeImages:
         """Keep the frame when it became a keyframe."""
         if not record.pose.keyframe:
             return
-        rgb, depth = view.rgb, static_depth(view.depth, mask)
+        rgb, depth = view.rgb, np.minimum(unmasked(view.depth, mask), _FARTHEST)
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
@@ -62,7 +65,7 @@ class KeyframeImages:
         self._index.append((view.t, len(jpeg), len(png)))
 
     def __iter__(self) -> Iterator[Frame]:
-        """(t s, colour [H, W, 3] RGB, static depth [H, W] m, 0 = none) of every keyframe, without distortion."""
+        """(t s, colour [H, W, 3] RGB, unmasked depth [H, W] m, 0 = none) of every keyframe, without distortion."""
         self._file.seek(0)
         for t, colour, depth in self._index:
             jpeg, png = (np.frombuffer(self._file.read(size), np.uint8) for size in (colour, depth))
@@ -80,17 +83,23 @@ def _pinhole_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
-def static_depth(depth: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-    """[H, W] m: the depth that may enter a map of what stands still, 0 elsewhere.
+def unmasked(depth: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """[H, W] m, 0 = none: depth without what lies under the mask, which is grown once more."""
+    if mask is None:
+        return depth
+    return np.where(grow(mask, _MASK_BAND * mask.shape[1]), 0, depth).astype(np.float32)
 
-    Refused: what lies under the mask grown once more, beside a depth edge, or beyond the sensor's good range.
-    """
+
+def sure(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H, W] m, 0 = none: depth without readings beside a depth edge or beyond the sensor's good range."""
     kernel = np.ones((5, 5), dtype=np.uint8)
-    near = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), kernel)
-    keep = (depth > 0) & (depth <= _FAR) & (cv2.dilate(depth, kernel) - near <= _EDGE * depth)
-    if mask is not None:
-        keep &= ~grow(mask, _MASK_BAND * mask.shape[1])
-    return np.where(keep, depth, 0).astype(np.float32)
+    step = cv2.dilate(depth, kernel) - _nearest(depth, kernel)
+    return np.where((depth <= _FAR) & (step <= _EDGE * depth), depth, 0).astype(np.float32)
+
+
+def _nearest(depth: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[H, W] m: the smallest reading around every pixel, infinite where there is none."""
+    return np.asarray(cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), kernel), np.float32)
 
 
 def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, voxel: float) -> Cloud:
@@ -103,6 +112,7 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
     count = 0
     for t, rgb, depth in images:
         if t in poses:
+            depth = sure(depth)
             seen = depth > 0
             local = rays[seen] * depth[seen][:, None]
             grid.add((local - poses[t][:3, 3]) @ poses[t][:3, :3], rgb[seen], count)
@@ -112,7 +122,7 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
     for t, _, depth in images:
         if t in poses:
             balance += _evidence(points, depth, poses[t], camera)
-    return Cloud(points[balance >= 0], colours[balance >= 0])
+    return Cloud(points[balance > 0], colours[balance > 0])
 
 
 def _rays(camera: Camera) -> Array:
@@ -122,7 +132,7 @@ def _rays(camera: Camera) -> Array:
 
 
 def _evidence(points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Camera) -> NDArray[np.int32]:
-    """[n] what one keyframe says of every point: 1 = there it is, -1 = the view goes through it, 0 = nothing.
+    """[n] what one keyframe says of every point: 1 = there it is, -2 = the view goes through it, 0 = nothing.
 
     A view goes through when all readings within a pixel lie behind the point.
     """
@@ -133,10 +143,9 @@ def _evidence(points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Ca
     columns, rows = np.rint(camera.project(local[ahead])).astype(np.int64).T
     inside = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
     ahead, columns, rows = ahead[inside], columns[inside], rows[inside]
-    nearest = cv2.erode(depth, np.ones((3, 3), dtype=np.uint8))  # 0 where one of the readings is missing
-    margin = _NOISE[0] + _NOISE[1] * z[ahead] ** 2
-    there = (np.abs(depth[rows, columns] - z[ahead]) <= margin) & (depth[rows, columns] > 0)
-    through = nearest[rows, columns] > z[ahead] + margin
-    verdict[ahead[there]] = 1
-    verdict[ahead[through]] = -1
+    nearest = _nearest(depth, np.ones((3, 3), dtype=np.uint8))[rows, columns]
+    behind, margin = depth[rows, columns] - z[ahead], _NOISE[0] + _NOISE[1] * z[ahead] ** 2
+    reading = depth[rows, columns] > 0
+    verdict[ahead[reading & (np.abs(behind) <= margin)]] = 1
+    verdict[ahead[reading & (nearest > z[ahead] + margin)]] = -_DOUBT
     return verdict

@@ -69,6 +69,7 @@ def slam(
         method: which parts of the method run.
         cloud: write cloud.ply too, the dense coloured points of all that stands still.
     """
+    _check_options(out, model, masks)
     if not sequence.is_dir():
         raise DataError(f"{sequence}: no such folder")
     intrinsics, origin = choose_camera(sequence, camera)
@@ -108,9 +109,7 @@ def run_source(
     watchers: called after every frame; origin: words about the source for config.yaml. Raises DataError when no frame
     comes.
     """
-    if model is not None and masks is not None:
-        raise DataError("give --model or --masks, not both")
-    check_out(out)
+    _check_options(out, model, masks)
     culling, method = culling or Culling(), method or Method()
     mask_of = _mask_source(model, masks, source.camera, culling)
     options = {"model": model, "masks": masks, "seed": seed, "features": features}
@@ -145,6 +144,12 @@ def summary(metrics: dict[str, Any]) -> str:
         if key in metrics:
             rows.append((key, "  ".join(f"{name} {value:.4f}" for name, value in metrics[key].items())))
     return "\n".join(f"  {name:<16}{text}" for name, text in rows)
+
+
+def _check_options(out: Path, model: Path | None, masks: Path | None) -> None:
+    if model is not None and masks is not None:
+        raise DataError("give --model or --masks, not both")
+    check_out(out)
 
 
 def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:

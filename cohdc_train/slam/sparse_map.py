@@ -76,7 +76,7 @@ def from_above(cloud: Cloud, poses: Sequence[Array]) -> NDArray[np.uint8]:
     scale = (_SIDE - 2 * _BORDER) / max(float((high - low).max()), 0.1)
     width, rows = (np.ceil((high - low) * scale).astype(int) + 2 * _BORDER).tolist()
     image = np.full((rows, width, 3), 255, dtype=np.uint8)
-    radius = 0 if len(cloud) > 50_000 else 1
+    radius = int(np.clip(np.sqrt(rows * width / (len(points) + 1)) / 2, 1, 3))
     columns, lines = np.rint((flat - low) * scale + _BORDER).astype(np.int64).T
     for dx in range(-radius, radius + 1):
         for dy in range(-radius, radius + 1):
