@@ -18,12 +18,10 @@ from cohdc_train.slam.sparse_map import Cloud
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.voxels import VoxelGrid
 
-_FAR = 5.0  # m: a Kinect errs by 4 cm and more beyond
 _EDGE = 0.04  # of the depth: a larger step within two pixels is an edge, where near and far mix
 _MASK_BAND = 0.01  # of the image's width by which a mask grows once more: depth images smear outlines
-_UNITS = 10_000.0  # per m, in the file of kept depth images
-_FARTHEST = 6.5  # m: what those can hold
-_NOISE = 0.03, 0.01  # m and m / m^2: a depth z is held to be within a + b z^2 of a surface it shows
+_UNITS = 50_000.0  # per camera.far, in the file of kept depth images, which hold 1.3 of it
+_NOISE = 0.03, 0.01  # m, and a Kinect's m / m^2: depth z is held to be within a + b z^2 of the surface it shows
 
 _DOUBT = 2  # a view through a point outweighs so many that show it
 
@@ -40,6 +38,7 @@ class KeyframeImages:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close
         self._index: list[tuple[float, int, int]] = []  # t, bytes of colour, bytes of depth
         self._maps = _pinhole_maps(camera)
+        self._units = _UNITS / camera.far  # per m
 
     def __enter__(self) -> Self:
         return self
@@ -54,12 +53,12 @@ class KeyframeImages:
         """Keep the frame when it became a keyframe."""
         if not record.pose.keyframe:
             return
-        rgb, depth = view.rgb, np.minimum(unmasked(view.depth, mask), _FARTHEST)
+        rgb, depth = view.rgb, np.minimum(unmasked(view.depth, mask), 65_535 / self._units)
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
         jpeg = cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-        units = np.rint(depth * _UNITS).astype(np.uint16)
+        units = np.rint(depth * self._units).astype(np.uint16)
         png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         self._file.write(jpeg + png)
         self._index.append((view.t, len(jpeg), len(png)))
@@ -70,7 +69,7 @@ class KeyframeImages:
         for t, colour, depth in self._index:
             jpeg, png = (np.frombuffer(self._file.read(size), np.uint8) for size in (colour, depth))
             rgb = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), np.uint8)  # RGB, for it was encoded as it was
-            yield t, rgb, np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32) / np.float32(_UNITS)
+            yield t, rgb, np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32) / np.float32(self._units)
 
 
 def _pinhole_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
@@ -90,11 +89,19 @@ def unmasked(depth: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDAr
     return np.where(grow(mask, _MASK_BAND * mask.shape[1]), 0, depth).astype(np.float32)
 
 
-def sure(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+def sure(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     """[H, W] m, 0 = none: depth without readings beside a depth edge or beyond the sensor's good range."""
     kernel = np.ones((5, 5), dtype=np.uint8)
     step = cv2.dilate(depth, kernel) - _nearest(depth, kernel)
-    return np.where((depth <= _FAR) & (step <= _EDGE * depth), depth, 0).astype(np.float32)
+    allowed = _EDGE * depth
+    if camera.baseline:
+        allowed = np.maximum(allowed, 2 * _spread(camera) * depth**2)
+    return np.where((depth <= camera.far) & (step <= allowed), depth, 0).astype(np.float32)
+
+
+def _spread(camera: Camera) -> float:
+    """m / m^2 by which depth errs with its square: a Kinect's, or one px of a stereo pair's disparity."""
+    return 1 / (camera.fx * camera.baseline) if camera.baseline else _NOISE[1]
 
 
 def _nearest(depth: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -112,7 +119,7 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
     count = 0
     for t, rgb, depth in images:
         if t in poses:
-            depth = sure(depth)
+            depth = sure(depth, camera)
             seen = depth > 0
             local = rays[seen] * depth[seen][:, None]
             grid.add((local - poses[t][:3, 3]) @ poses[t][:3, :3], rgb[seen], count)
@@ -144,7 +151,7 @@ def _evidence(points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Ca
     inside = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
     ahead, columns, rows = ahead[inside], columns[inside], rows[inside]
     nearest = _nearest(depth, np.ones((3, 3), dtype=np.uint8))[rows, columns]
-    behind, margin = depth[rows, columns] - z[ahead], _NOISE[0] + _NOISE[1] * z[ahead] ** 2
+    behind, margin = depth[rows, columns] - z[ahead], _NOISE[0] + _spread(camera) * z[ahead] ** 2
     reading = depth[rows, columns] > 0
     verdict[ahead[reading & (np.abs(behind) <= margin)]] = 1
     verdict[ahead[reading & (nearest > z[ahead] + margin)]] = -_DOUBT

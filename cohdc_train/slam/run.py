@@ -31,6 +31,7 @@ from cohdc_train.slam.results import (
     write_run,
 )
 from cohdc_train.slam.source import Recorded, Source, View
+from cohdc_train.slam.stereo import RecordedStereo
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory
@@ -51,14 +52,15 @@ def slam(
     method: Method = Method(),  # noqa: B008 - the same
     cloud: bool = False,
 ) -> dict[str, Any]:
-    """Track an RGB-D camera through a TUM-format sequence; people are removed when masks or a model are given.
+    """Track an RGB-D camera or a stereo pair through a TUM-format sequence, people removed by masks or a model.
 
     Writes trajectory.txt (TUM format, every tracked frame), metrics.json, frames.csv, config.yaml, map.ply, map.png and
     pictures/ into the output folder, and returns the metrics. Raises DataError, naming file and line, for input that
     cannot be used.
 
     Args:
-        sequence: folder with rgb.txt, depth.txt and their images; groundtruth.txt is used for scores when there.
+        sequence: folder with rgb.txt, depth.txt and their images, or left.txt and right.txt of a rectified stereo pair
+            whose camera yaml has a baseline; groundtruth.txt is used for scores when there.
         out: folder for the results; files of a former run are replaced.
         model: ONNX written by `cohdc export`, or a shipped network's name: person; every frame is segmented.
         masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
@@ -73,9 +75,9 @@ def slam(
     if not sequence.is_dir():
         raise DataError(f"{sequence}: no such folder")
     intrinsics, origin = choose_camera(sequence, camera)
-    source = Recorded(sequence, intrinsics)
+    source = _recorded(sequence, intrinsics)
     print(f"camera: {origin}")
-    print(f"sequence: {len(source)} pairs; {source.without_depth} colour images have no depth image and are left out")
+    print(f"sequence: {len(source)} pairs; {source.without_depth} images have no partner and are left out")
     return run_source(
         source,
         out=out,
@@ -152,6 +154,10 @@ def _check_options(out: Path, model: Path | None, masks: Path | None) -> None:
     check_out(out)
 
 
+def _recorded(folder: Path, camera: Camera) -> Source:
+    return RecordedStereo(folder, camera) if (folder / "left.txt").is_file() else Recorded(folder, camera)
+
+
 def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:
     if masks is not None:
         return FolderMasks(masks, camera, culling)
@@ -200,7 +206,8 @@ def _step(
         write_jpeg(pictures / f"{view.stamp}_before.jpg", draw_before(view.rgb, unmasked, mask))
         if mask is not None:
             write_jpeg(pictures / f"{view.stamp}_after.jpg", draw_after(view.rgb, tracker.features, mask))
-    return mask, FrameRecord(view.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms)
+    culled = 0.0 if mask is None else float(mask.mean())
+    return mask, FrameRecord(view.stamp, pose, culled, segment_ms, view.depth_ms)
 
 
 def _progress(done: int, count: int, record: FrameRecord) -> None:

@@ -17,7 +17,8 @@ class View:
     """One frame as the tracker takes it.
 
     t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending, which a mask in a
-    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading.
+    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading;
+    depth_ms: what it took to compute.
     """
 
     t: float
@@ -25,6 +26,7 @@ class View:
     name: str
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
+    depth_ms: float = 0.0
 
 
 class Source(Protocol):

@@ -59,7 +59,7 @@ class Tracker:
         self.budget = features
         self.features: Features | None = None  # of the latest frame
         self._extract = FeatureExtractor(camera, features)
-        self._weighing = Weighing(camera)
+        self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
         self._rng = np.random.default_rng(seed)
         self._velocity = np.eye(4)
         self._last: _Fit | None = None

@@ -136,7 +136,7 @@ def test_depth_is_refused_beside_edges_masks_and_far_away() -> None:
     depth[:, 90:] = 6.0
     mask = np.zeros(depth.shape, np.bool_)
     mask[:, :10] = True
-    kept = sure(unmasked(depth, mask))[20] > 0
+    kept = sure(unmasked(depth, mask), CAMERA)[20] > 0
     assert np.flatnonzero(kept).tolist() == [*range(10 + 1, 60 - 2), *range(60 + 2, 90 - 2)]
 
 
