@@ -18,6 +18,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera, choose_camera
 from cohdc_train.slam.culling import Culling, FolderMasks, MaskSource, ModelMasks, no_masks
 from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.live import Followed, LiveSource, stopped_by_ctrl_c
 from cohdc_train.slam.map_files import MapFiles
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.results import (
@@ -30,8 +31,8 @@ from cohdc_train.slam.results import (
     write_jpeg,
     write_run,
 )
-from cohdc_train.slam.source import Recorded, Source, View
-from cohdc_train.slam.stereo import RecordedStereo
+from cohdc_train.slam.source import Recorded, Source, View, rgbd_layout
+from cohdc_train.slam.stereo import stereo_layout
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory
@@ -51,6 +52,8 @@ def slam(
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
     method: Method = Method(),  # noqa: B008 - the same
     cloud: bool = False,
+    follow: bool = False,
+    idle: float = 10.0,
 ) -> dict[str, Any]:
     """Track an RGB-D camera or a stereo pair through a TUM-format sequence, people removed by masks or a model.
 
@@ -70,16 +73,16 @@ def slam(
         culling: how masks are made.
         method: which parts of the method run.
         cloud: write cloud.ply too, the dense coloured points of all that stands still.
+        follow: the sequence is still being written: take frames as its lists grow.
+        idle: s without a new frame after which a followed sequence has ended; a file named done there ends it, too.
     """
     _check_options(out, model, masks)
     if not sequence.is_dir():
         raise DataError(f"{sequence}: no such folder")
     intrinsics, origin = choose_camera(sequence, camera)
-    source = _recorded(sequence, intrinsics)
     print(f"camera: {origin}")
-    print(f"sequence: {len(source)} pairs; {source.without_depth} images have no partner and are left out")
     return run_source(
-        source,
+        _source(sequence, intrinsics, follow, idle),
         out=out,
         model=model,
         masks=masks,
@@ -121,7 +124,7 @@ def run_source(
     with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         part = Path(folder)
         tracker = Tracker(source.camera, features, seed, method)
-        with MapFiles(source.camera, part, cloud) as files:
+        with MapFiles(source.camera, part, cloud) as files, stopped_by_ctrl_c(source):
             records = _run(tracker, source, mask_of, part, [files, *watchers])
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
@@ -154,8 +157,15 @@ def _check_options(out: Path, model: Path | None, masks: Path | None) -> None:
     check_out(out)
 
 
-def _recorded(folder: Path, camera: Camera) -> Source:
-    return RecordedStereo(folder, camera) if (folder / "left.txt").is_file() else Recorded(folder, camera)
+def _source(folder: Path, camera: Camera, follow: bool, idle: float) -> Source:
+    stereo = (folder / "left.txt").is_file() or (camera.baseline > 0 and not (folder / "rgb.txt").is_file())
+    layout = stereo_layout(camera) if stereo else rgbd_layout(camera)
+    if follow:
+        print(f"sequence: {layout.first} and {layout.second} as they grow; a file {folder / 'done'} or Ctrl-C ends it")
+        return Followed(folder, camera, layout, idle)
+    source = Recorded(folder, camera, layout)
+    print(f"sequence: {len(source)} pairs; {source.without_depth} images have no partner and are left out")
+    return source
 
 
 def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:
@@ -174,13 +184,18 @@ def _run(
     (part / "pictures").mkdir()
     count = len(source)
     pictured = _pictured(count)
-    records = []
-    for index, view in enumerate(source):
-        mask, record = _step(tracker, view, mask_of, part / "pictures" if index in pictured else None)
-        records.append(record)
-        for watcher in watchers:
-            watcher(view, mask, record, tracker)
-        _progress(index + 1, count, record)
+    records: list[FrameRecord] = []
+    try:
+        for index, view in enumerate(source):
+            mask, record = _step(tracker, view, mask_of, part / "pictures" if index in pictured else None)
+            records.append(record)
+            for watcher in watchers:
+                watcher(view, mask, record, tracker)
+            _progress(index + 1, count, record)
+    except DataError as error:
+        if not records or not isinstance(source, LiveSource):
+            raise
+        print(f"ended: {error}", file=sys.stderr)  # what a live run has so far is not lost
     if not records:
         raise DataError("no frame came: nothing is written")
     return records

@@ -32,26 +32,25 @@ class Cloud:
 
 
 class PointColours:
-    """Watches a run and keeps the colour of every map point, as the last keyframe that saw it shows it."""
+    """Watches a run and keeps the colours of every keyframe's corners (some 3 kB each), for the points they become."""
 
     def __init__(self) -> None:
-        self._colours = np.zeros((1024, 3), dtype=np.uint8)
+        self._colours: dict[float, NDArray[np.uint8]] = {}  # t of a keyframe -> [corners, 3] RGB
 
     def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
-        """Note the colours of a new keyframe's points."""
-        keyframe = tracker.map.keyframes[-1] if record.pose.keyframe else None
-        if keyframe is None or keyframe.t != view.t:
-            return
-        while len(self._colours) < tracker.map.size:
-            self._colours = np.concatenate([self._colours, np.zeros_like(self._colours)])
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
-        columns, rows = np.rint(keyframe.features.pixels[corners]).astype(np.int64).T
-        self._colours[keyframe.point_ids[corners]] = view.rgb[rows, columns]
+        """Note the colours when the frame became a keyframe."""
+        if record.pose.keyframe and tracker.features is not None:
+            columns, rows = np.rint(tracker.features.pixels).astype(np.int64).T
+            self._colours[view.t] = view.rgb[rows, columns]
 
     def cloud(self, world: Map) -> Cloud:
-        """The points that at least three keyframes see (all of them, in a map of fewer)."""
+        """The points that at least three keyframes see (all of them, in a map of fewer), in the last one's colours."""
+        colours = np.zeros((world.size, 3), dtype=np.uint8)
+        for keyframe in world.keyframes:
+            corners = np.flatnonzero(keyframe.point_ids >= 0)
+            colours[keyframe.point_ids[corners]] = self._colours[keyframe.t][corners]
         enough = world.seen_by[: world.size] >= max(1, min(_SEEN_BY, len(world.keyframes)))
-        return Cloud(world.positions[: world.size][enough], self._colours[: world.size][enough])
+        return Cloud(world.positions[: world.size][enough], colours[enough])
 
 
 def from_above(cloud: Cloud, poses: Sequence[Array]) -> NDArray[np.uint8]:

@@ -1,8 +1,6 @@
 """Depth from a rectified stereo pair: semi-global matching, then the paper's reprojection matrix Q."""
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,8 +8,8 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.source import View
-from cohdc_train.slam.tum import Entry, read_pairs, read_rgb
+from cohdc_train.slam.source import Layout, View
+from cohdc_train.slam.tum import Entry, read_rgb
 
 _MAX_DIFFERENCE = 0.005  # s between the two images of a pair: a walking camera moves 5 mm in that time
 _NEAREST_SHARE = 0.2  # of the image's width: the largest disparity looked for
@@ -73,29 +71,14 @@ class StereoMatcher:
         return np.where(matched, Z, 0).astype(np.float32)
 
 
-class RecordedStereo:
-    """Rectified pairs listed in left.txt and right.txt, which look like TUM's rgb.txt; views are the left camera's.
+def stereo_layout(camera: Camera) -> Layout:
+    """Rectified pairs: left.txt and right.txt; views are the left camera's. Raises DataError as StereoMatcher does."""
+    matcher = StereoMatcher(camera)
 
-    Raises DataError as Recorded and StereoMatcher do.
-    """
-
-    def __init__(self, folder: Path, camera: Camera) -> None:
-        self.camera = camera
-        self._matcher = StereoMatcher(camera)
-        self._pairs, self.without_depth = read_pairs(folder / "left.txt", folder / "right.txt", _MAX_DIFFERENCE)
-        truth = folder / "groundtruth.txt"
-        self.groundtruth = truth if truth.is_file() else None
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __iter__(self) -> Iterator[View]:
-        for left, right in self._pairs:
-            yield self.view(left, right)
-
-    def view(self, left: Entry, right: Entry) -> View:
-        """The view of one pair. Raises DataError for an image that cannot be used."""
-        pair = read_rgb(left.image, self.camera), read_rgb(right.image, self.camera)
+    def view(left: Entry, right: Entry) -> View:
+        pair = read_rgb(left.image, camera), read_rgb(right.image, camera)
         start = time.perf_counter()
-        depth = self._matcher(*pair)
+        depth = matcher(*pair)
         return View(left.t, left.stamp, left.image.stem, pair[0], depth, 1e3 * (time.perf_counter() - start))
+
+    return Layout("left.txt", "right.txt", _MAX_DIFFERENCE, view)

@@ -14,7 +14,8 @@ from plane_world import CAMERA, CAMERA_YAML, camera_path, passer_by, render, roo
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera, load_camera
-from cohdc_train.slam.stereo import RecordedStereo, StereoMatcher, reproject, reprojection_matrix
+from cohdc_train.slam.source import Recorded
+from cohdc_train.slam.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_layout
 
 BASELINE = 0.12
 PAIR = Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1.0, baseline=BASELINE)
@@ -121,4 +122,4 @@ def test_pairs_that_are_not_simultaneous_are_none(tmp_path: Path) -> None:
     sequence = write_stereo(tmp_path / "pair", 2)
     (sequence / "right.txt").write_text("100.010 right/0000.png\n")
     with pytest.raises(DataError, match=r"pair: no image of left\.txt lies within 0\.005 s of one of right\.txt"):
-        RecordedStereo(sequence, PAIR)
+        Recorded(sequence, PAIR, stereo_layout(PAIR))
