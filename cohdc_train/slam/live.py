@@ -46,21 +46,24 @@ class LiveSource:
 
 
 class Live(LiveSource):
-    """A camera of one's own: anything that gives (rgb, depth_m, t) one after the other.
+    """A camera of one's own: anything that gives (rgb, depth_m, t) one after the other, or None while nothing comes.
 
     rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, registered to the colour image, 0 or nan = no
     reading; t: s, rising. Raises DataError for a frame of another shape or a time that does not rise.
     """
 
-    def __init__(self, camera: Camera, frames: Iterable[Frame]) -> None:
+    def __init__(self, camera: Camera, frames: Iterable[Frame | None]) -> None:
         super().__init__(camera)
         self._frames = frames
 
     def __iter__(self) -> Iterator[View]:
         last = -np.inf
-        for rgb, depth_m, t in self._frames:
+        for frame in self._frames:
             if self._stopped.is_set():
                 return
+            if frame is None:
+                continue
+            rgb, depth_m, t = frame
             size = (self.camera.height, self.camera.width)
             if rgb.shape != (*size, 3) or rgb.dtype != np.uint8 or depth_m.shape != size:
                 found = f"colour {rgb.shape} {rgb.dtype} and depth {depth_m.shape}"
