@@ -44,7 +44,7 @@ def camera_of(info: Any) -> Camera:
 
 
 def rgb_of(image: Any) -> NDArray[np.uint8]:
-    """sensor_msgs/Image to [H, W, 3] uint8 RGB. Raises DataError for an encoding other than rgb8, bgr8 and their kin."""
+    """sensor_msgs/Image to [H, W, 3] uint8 RGB. Raises DataError unless it is rgb8, bgr8, rgba8, bgra8 or mono8."""
     if image.encoding not in _COLOURS:
         raise DataError(f"colour image: encoding {image.encoding!r} is not one of {' '.join(_COLOURS)}")
     channels, code = _COLOURS[image.encoding]

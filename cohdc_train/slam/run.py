@@ -4,7 +4,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from cohdc_train.slam.results import (
 from cohdc_train.slam.source import Recorded, Source, View, rgbd_layout
 from cohdc_train.slam.stereo import stereo_layout
 from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.viewer import Viewer
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory
 
@@ -54,6 +55,8 @@ def slam(
     cloud: bool = False,
     follow: bool = False,
     idle: float = 10.0,
+    view: bool = False,
+    rrd: Path | None = None,
 ) -> dict[str, Any]:
     """Track an RGB-D camera or a stereo pair through a TUM-format sequence, people removed by masks or a model.
 
@@ -75,6 +78,8 @@ def slam(
         cloud: write cloud.ply too, the dense coloured points of all that stands still.
         follow: the sequence is still being written: take frames as its lists grow.
         idle: s without a new frame after which a followed sequence has ended; a file named done there ends it, too.
+        view: show the run in rerun's window while it goes; needs `pip install 'cohdc-train[view]'`.
+        rrd: file to record the same for rerun, to be looked at later.
     """
     _check_options(out, model, masks)
     if not sequence.is_dir():
@@ -91,6 +96,8 @@ def slam(
         culling=culling,
         method=method,
         cloud=cloud,
+        view=view,
+        rrd=rrd,
         origin={"sequence": str(sequence), "camera_origin": origin},
     )
 
@@ -106,6 +113,8 @@ def run_source(
     culling: Culling | None = None,
     method: Method | None = None,
     cloud: bool = False,
+    view: bool = False,
+    rrd: Path | None = None,
     watchers: Sequence[Watcher] = (),
     origin: dict[str, str] | None = None,
 ) -> dict[str, Any]:
@@ -124,8 +133,13 @@ def run_source(
     with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         part = Path(folder)
         tracker = Tracker(source.camera, features, seed, method)
-        with MapFiles(source.camera, part, cloud) as files, stopped_by_ctrl_c(source):
-            records = _run(tracker, source, mask_of, part, [files, *watchers])
+        with ExitStack() as stack:
+            files = stack.enter_context(MapFiles(source.camera, part, cloud))
+            watchers = [files, *watchers]
+            if view or rrd is not None:
+                watchers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
+            stack.enter_context(stopped_by_ctrl_c(source))
+            records = _run(tracker, source, mask_of, part, watchers)
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "without_depth": source.without_depth}
