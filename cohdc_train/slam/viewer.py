@@ -1,6 +1,7 @@
 """A run in rerun's viewer, or in a file for it: camera, image with mask, map, way and times. Needs the extra `view`."""
 
 import os
+import sys
 from pathlib import Path
 from typing import Any, Self
 
@@ -8,15 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.errors import MissingExtraError
+from cohdc_train.errors import CohdcError, MissingExtraError
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.results import FrameRecord
 from cohdc_train.slam.source import View
 from cohdc_train.slam.sparse_map import PointColours
 from cohdc_train.slam.tracking import Tracker
 
+_LAST = 5.0  # s that rerun has for the rest when a run is over
 _MEMORY = "25%"  # of the machine's, which the viewer may fill before it forgets the oldest
 _FRUSTUM = 0.15  # m
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 _MASK = (230, 40, 40)  # RGB
 _WAY = (250, 160, 40)
 
@@ -24,7 +27,7 @@ _WAY = (250, 160, 40)
 class Viewer:
     """Watches a run and shows it. window: open rerun's viewer; file: write an .rrd for it, whole when the run is over.
 
-    Raises MissingExtraError when rerun-sdk is not installed.
+    Raises MissingExtraError when rerun-sdk is not installed, CohdcError when its window cannot be opened.
     """
 
     def __init__(self, camera: Camera, window: bool, file: Path | None) -> None:
@@ -44,7 +47,7 @@ class Viewer:
     def _open(self, window: bool) -> None:
         rerun, sinks = self._rerun, []
         if window:
-            self._stream.spawn(connect=False, memory_limit=_MEMORY, hide_welcome_screen=True)
+            self._spawn()
             sinks.append(rerun.GrpcSink())
         if self._file is not None:
             self._file.parent.mkdir(parents=True, exist_ok=True)
@@ -58,6 +61,18 @@ class Viewer:
         )
         layout = blueprint.Horizontal(blueprint.Spatial3DView(origin="world", name="map"), views, column_shares=[3, 2])
         self._stream.set_sinks(*sinks, default_blueprint=blueprint.Blueprint(layout, collapse_panels=True))
+
+    def _spawn(self) -> None:
+        """Start the viewer, or find one that runs. pip put it beside Python, which need not be on the PATH."""
+        before = os.environ.get("PATH", "")
+        os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{before}"
+        try:
+            self._stream.spawn(connect=False, memory_limit=_MEMORY, hide_welcome_screen=True)
+        except RuntimeError as error:
+            reason = str(error).partition("\n")[0]
+            raise CohdcError(f"--view: rerun's window cannot be opened: {reason}") from error
+        finally:
+            os.environ["PATH"] = before
 
     def _part(self) -> Path:
         assert self._file is not None
@@ -79,7 +94,10 @@ class Viewer:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        self._stream.flush()
+        try:
+            self._stream.flush(timeout_sec=_LAST)
+        except RuntimeError as error:  # a window that was closed costs no results
+            print(f"rerun did not get everything: {error}", file=sys.stderr)
         self._stream.disconnect()
         if self._file is not None and kind is None:
             os.replace(self._part(), self._file)
@@ -93,7 +111,7 @@ class Viewer:
         self._stream.set_time("time", duration=view.t - self._start)
         if pose.T_wc is not None:
             log("world/camera", rerun.Transform3D(translation=pose.T_wc[:3, 3], mat3x3=pose.T_wc[:3, :3]))
-        jpeg = cv2.imencode(".jpg", cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
+        jpeg = cv2.imencode(".jpg", cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
         log("world/camera/image", rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if mask is not None:
             log("world/camera/mask", rerun.SegmentationImage(mask.astype(np.uint8), opacity=0.5))

@@ -1,12 +1,16 @@
 """Frames that come while the run goes: a folder that grows, a camera of one's own, Ctrl-C."""
 
+import json
 import os
+import re
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import cv2
 import numpy as np
@@ -164,6 +168,44 @@ def test_a_camera_of_ones_own(tmp_path: Path) -> None:
     assert [row[0] for row in seen] == [index / 30 for index in range(FRAMES)]
     assert all(tracked and mask is None for _, tracked, mask in seen)
     assert (tmp_path / "run" / "trajectory.txt").read_text().count("\n") == FRAMES + 1
+
+
+class RealSense(ModuleType):
+    """What docs/live.md uses of pyrealsense2, with a camera that ends after some frames."""
+
+    def __init__(self) -> None:
+        super().__init__("pyrealsense2")
+        lens = SimpleNamespace(fx=260.0, fy=260.0, ppx=159.5, ppy=119.5, width=320, height=240, coeffs=[0.0] * 5)
+        stream = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens))
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.001)
+        device = SimpleNamespace(first_depth_sensor=lambda: sensor)
+        profile = SimpleNamespace(get_device=lambda: device, get_stream=lambda _: stream)
+        coming = frames(FRAMES)
+        self.stream = SimpleNamespace(depth=1, color=2)
+        self.format = SimpleNamespace(z16=1, rgb8=2)
+        self.align = lambda _: SimpleNamespace(process=lambda pair: pair)
+        self.config = lambda: SimpleNamespace(enable_stream=lambda *_: None)
+        self.pipeline = lambda: SimpleNamespace(start=lambda _: profile, wait_for_frames=lambda: self._next(coming))
+
+    def _next(self, coming: Iterator[tuple[NDArray[np.uint8], NDArray[np.float32], float]]) -> SimpleNamespace:
+        try:
+            rgb, depth, t = next(coming)
+        except StopIteration:
+            raise DataError("the camera was unplugged") from None
+        colour = SimpleNamespace(get_data=lambda: rgb)
+        units = SimpleNamespace(get_data=lambda: np.nan_to_num(1000 * depth).astype(np.uint16))
+        times = {"get_timestamp": lambda: 1000 * t}
+        return SimpleNamespace(get_color_frame=lambda: colour, get_depth_frame=lambda: units, **times)
+
+
+def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "live.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", RealSense())
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "docs/live.md", "exec"), {})
+    metrics = json.loads((tmp_path / "runs" / "realsense" / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["coverage"]) == (FRAMES, 1.0)
 
 
 @pytest.mark.parametrize(
