@@ -82,12 +82,9 @@ def slam(
         rrd: file to record the same for rerun, to be looked at later.
     """
     _check_options(out, model, masks)
-    if not sequence.is_dir():
-        raise DataError(f"{sequence}: no such folder")
-    intrinsics, origin = choose_camera(sequence, camera)
-    print(f"camera: {origin}")
+    source, origin = _source(sequence, camera, follow, idle)
     return run_source(
-        _source(sequence, intrinsics, follow, idle),
+        source,
         out=out,
         model=model,
         masks=masks,
@@ -98,7 +95,7 @@ def slam(
         cloud=cloud,
         view=view,
         rrd=rrd,
-        origin={"sequence": str(sequence), "camera_origin": origin},
+        origin=origin,
     )
 
 
@@ -171,15 +168,23 @@ def _check_options(out: Path, model: Path | None, masks: Path | None) -> None:
     check_out(out)
 
 
-def _source(folder: Path, camera: Camera, follow: bool, idle: float) -> Source:
-    stereo = (folder / "left.txt").is_file() or (camera.baseline > 0 and not (folder / "rgb.txt").is_file())
-    layout = stereo_layout(camera) if stereo else rgbd_layout(camera)
+def _source(sequence: Path, camera: Path | None, follow: bool, idle: float) -> tuple[Source, dict[str, str]]:
+    """The frames of a folder, and what config.yaml says of where they come from."""
+    if not sequence.is_dir():
+        raise DataError(f"{sequence}: no such folder")
+    intrinsics, origin = choose_camera(sequence, camera)
+    print(f"camera: {origin}")
+    words = {"sequence": str(sequence), "camera_origin": origin}
+    stereo = (sequence / "left.txt").is_file() or (intrinsics.baseline > 0 and not (sequence / "rgb.txt").is_file())
+    layout = stereo_layout(intrinsics) if stereo else rgbd_layout(intrinsics)
     if follow:
-        print(f"sequence: {layout.first} and {layout.second} as they grow; a file {folder / 'done'} or Ctrl-C ends it")
-        return Followed(folder, camera, layout, idle)
-    source = Recorded(folder, camera, layout)
+        print(
+            f"sequence: {layout.first} and {layout.second} as they grow; a file {sequence / 'done'} or Ctrl-C ends it"
+        )
+        return Followed(sequence, intrinsics, layout, idle), words
+    source = Recorded(sequence, intrinsics, layout)
     print(f"sequence: {len(source)} pairs; {source.without_depth} images have no partner and are left out")
-    return source
+    return source, words
 
 
 def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:
