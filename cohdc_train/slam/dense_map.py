@@ -22,20 +22,19 @@ _EDGE = 0.04  # of the depth: a larger step within two pixels is an edge, where 
 _MASK_BAND = 0.01  # of the image's width by which a mask grows once more: depth images smear outlines
 _UNITS = 50_000.0  # per camera.far, in the file of kept depth images, which hold 1.3 of it
 _NOISE = 0.03, 0.01  # m, and a Kinect's m / m^2: depth z is held to be within a + b z^2 of the surface it shows
-
 _DOUBT = 2  # a view through a point outweighs so many that show it
 
 Frame = tuple[float, NDArray[np.uint8], NDArray[np.float32]]
 
 
 class KeyframeImages:
-    """Watches a run and keeps colour and unmasked depth of its keyframes in a nameless file on disk (some 300 kB each).
+    """Watches a run; keeps colour and unmasked depth of its keyframes in a nameless file on disk, 200 to 600 kB each.
 
-    folder: where that file lies; it vanishes with `close`.
+    folder: where that file lies until the block it is opened in ends.
     """
 
     def __init__(self, camera: Camera, folder: Path) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
         self._index: list[tuple[float, int, int]] = []  # t, bytes of colour, bytes of depth
         self._maps = _pinhole_maps(camera)
         self._units = _UNITS / camera.far  # per m
@@ -46,9 +45,6 @@ class KeyframeImages:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def __len__(self) -> int:
-        return len(self._index)
-
     def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
         """Keep the frame when it became a keyframe."""
         if not record.pose.keyframe:
@@ -57,7 +53,7 @@ class KeyframeImages:
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
-        jpeg = cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
         units = np.rint(depth * self._units).astype(np.uint16)
         png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         self._file.write(jpeg + png)
@@ -68,8 +64,12 @@ class KeyframeImages:
         self._file.seek(0)
         for t, colour, depth in self._index:
             jpeg, png = (np.frombuffer(self._file.read(size), np.uint8) for size in (colour, depth))
-            rgb = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), np.uint8)  # RGB, for it was encoded as it was
-            yield t, rgb, np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32) / np.float32(self._units)
+            bgr = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), np.uint8)
+            yield (
+                t,
+                bgr[..., ::-1],
+                np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32) / np.float32(self._units),
+            )
 
 
 def _pinhole_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:

@@ -75,11 +75,11 @@ class Live(LiveSource):
 
 
 class Followed(LiveSource):
-    """A sequence's folder while its lists grow. Ends with a file `done` in it, after `idle` s without a new line, or
-    when stopped; every listed pair is given before.
+    """A sequence's folder while its lists grow.
 
-    Pairs are chosen in the order of time, nearest first. A line or image that cannot be used is told on stderr and
-    left out, but for the first, whose DataError is raised.
+    Ends with a file `done` in it or after `idle` s without a new line, when every listed pair has been given; at once
+    when stopped. Pairs are chosen in the order of time, nearest first. A line or image that cannot be used is told on
+    stderr and left out, but for the first, whose DataError is raised.
     """
 
     def __init__(self, folder: Path, camera: Camera, layout: Layout, idle: float) -> None:
