@@ -19,7 +19,7 @@ FRAMES, SIZE = 60, (240, 320)
 
 
 def in_the_world(run: Path, folder: Path) -> NDArray[np.float64]:
-    """[n, 3] points of a run's cloud in the ground truth's world, m, by the first pose: a short way fixes no rotation."""
+    """[n, 3] a run's cloud in the ground truth's world, m, by the first pose: a short way fixes no rotation."""
     truth, estimate = match(read_tum(folder / "groundtruth.txt"), read_tum(run / "trajectory.txt"))
     T = truth.poses[0] @ np.linalg.inv(estimate.poses[0])
     return np.asarray(read_ply(run / "cloud.ply")[0] @ T[:3, :3].T + T[:3, 3])
