@@ -95,6 +95,18 @@ def test_page_holds_everything_inside_itself(tmp_path: Path, truth_file: Path) -
     assert [file.name for file in (tmp_path / "page").iterdir()] == ["report.html"]
 
 
+def test_the_map_of_every_run_is_shown(tmp_path: Path, truth_file: Path) -> None:
+    runs = {name: run_folder(tmp_path / name, 0.01, pictures=False) for name in ("a", "b")}
+    cv2.imwrite(str(runs["b"] / "map.png"), np.full((48, 64, 3), 200, np.uint8))
+    write_report(tmp_path / "report.html", "Map", truth_file, runs)
+    page = Page((tmp_path / "report.html").read_text("utf-8"))
+    assert page.heads[-1] == "Map from above"
+    shown = [source for source in page.images if source.startswith("data:image/png")]
+    assert [base64.b64decode(source.partition("base64,")[2]) for source in shown] == [
+        (runs["b"] / "map.png").read_bytes()
+    ]
+
+
 def test_same_run_same_page(tmp_path: Path, truth_file: Path) -> None:
     runs = {"with": run_folder(tmp_path / "b", 0.01)}
     for name in ("one.html", "two.html"):

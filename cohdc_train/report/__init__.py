@@ -98,8 +98,8 @@ def write_report(
     """Write one self-contained HTML page about SLAM runs on a sequence.
 
     out: the HTML file, written whole or not at all; groundtruth: TUM file, None where there is none; runs: label ->
-    folder written by `slam` (trajectory.txt, metrics.json, pictures/<stamp>_before.jpg and _after.jpg); overlays: JPEG
-    or PNG images of predicted masks; tables: shown first. Sections without content are left out.
+    folder written by `slam` (trajectory.txt, metrics.json, map.png, pictures/<stamp>_before.jpg and _after.jpg);
+    overlays: JPEG or PNG images of predicted masks; tables: shown first. Sections without content are left out.
     Raises DataError naming a file of a run or an image that cannot be used.
     """
     truth = None if groundtruth is None else read_tum(groundtruth)
@@ -116,6 +116,10 @@ def write_report(
         parts.append(
             _svg(plot_errors(truth, aligned), "distance to ground truth of every matched pose, after alignment")
         )
+    maps = [(run.folder / "map.png", run.label) for run in loaded if (run.folder / "map.png").is_file()]
+    if maps:
+        parts.append("<h2>Map from above</h2>\n<p>What stands still; the way of the camera in red.</p>")
+        parts.append(_grid(maps))
     if overlays:
         parts.append(f"<h2>Predicted masks</h2>\n{_grid([(file, file.stem) for file in overlays])}")
     pictures = [item for run in loaded for item in _pictures(run)]

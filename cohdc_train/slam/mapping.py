@@ -11,7 +11,6 @@ from cohdc_train.slam.optimization import Observations, Weighing
 WINDOW = 12  # keyframes in local bundle adjustment
 FIXED = 3  # of them hold still and carry the frame of reference
 _FUSE_KEYFRAMES = 8
-_MAX_DEPTH = 5.0  # m: no new point beyond, where a Kinect errs by 4 cm and more
 _TRIAL = 3  # keyframes after which a point must have proved itself
 _MIN_SEEN_BY = 3
 _MIN_FOUND = 0.25
@@ -31,7 +30,7 @@ def insert_keyframe(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
 def add_points(world: Map, keyframe: Keyframe) -> None:
     """A point for every corner with depth that belongs to none."""
     features = keyframe.features
-    usable = (keyframe.point_ids < 0) & (features.depths <= _MAX_DEPTH)  # nan compares False
+    usable = (keyframe.point_ids < 0) & (features.depths <= world.camera.far)  # nan compares False
     world.add_points(keyframe, np.flatnonzero(usable))
 
 

@@ -24,22 +24,25 @@ _GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
 @dataclass(frozen=True)
 class FrameRecord:
     """One frame of a run. stamp: as rgb.txt writes it; culled: share of the pixels under the mask; segment_ms: time of
-    the mask."""
+    the mask; depth_ms: of the depth, where it was computed."""
 
     stamp: str
     pose: Pose
     culled: float
     segment_ms: float
+    depth_ms: float = 0.0
 
 
 def measure(records: list[FrameRecord], trajectory: Trajectory, groundtruth: Path | None) -> dict[str, Any]:
     """The numbers of metrics.json but the seed.
 
-    `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map` over keyframes only; `fps` is
-    frames over the time of all three stages. Raises DataError when the ground truth's file is broken.
+    `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map` over keyframes only, `depth` of
+    stereo pairs only; `fps` is frames over the time of all stages. Raises DataError when the ground truth's file is
+    broken.
     """
     poses = [record.pose for record in records]
-    times = {
+    depth = [record.depth_ms for record in records]
+    times = ({"depth": depth} if any(depth) else {}) | {
         "segment": [record.segment_ms for record in records],
         "track": [pose.track_ms for pose in poses],
         "map": [pose.map_ms for pose in poses if pose.keyframe],

@@ -71,7 +71,7 @@ class Tracker:
         self._extract = FeatureExtractor(camera, features)
         self._geometry = Geometry(camera)
         self._refiner = Refiner(self.map) if self.method.refinement else None
-        self._weighing = Weighing(camera)
+        self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
         self._rng = np.random.default_rng(seed)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._velocity = np.eye(4)

@@ -16,10 +16,9 @@ from cohdc_train.trajectory import associate
 
 @dataclass(frozen=True)
 class Frame:
-    """One associated pair; `t` is the colour image's stamp, s, `depth_t` the depth image's."""
+    """One associated pair; `t` is the colour image's stamp, s."""
 
     t: float
-    depth_t: float
     stamp: str
     rgb: Path
     depth: Path
@@ -41,10 +40,12 @@ class Sequence:
 
 
 @dataclass(frozen=True)
-class _Entry:
+class Entry:
+    """A line of a list. t: s; stamp: t as the line writes it; image: the file it names."""
+
     t: float
     stamp: str
-    name: str
+    image: Path
 
 
 def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
@@ -53,17 +54,20 @@ def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
     max_difference: s. Raises DataError naming file and line for a missing or broken list, stamps that do not rise, an
     image that is not there, or when nothing pairs.
     """
-    colours = _read_list(folder / "rgb.txt")
-    depths = _read_list(folder / "depth.txt")
-    times = np.array([entry.t for entry in colours]), np.array([entry.t for entry in depths])
-    pairs = associate(*times, max_difference).tolist()
+    pairs, alone = read_pairs(folder / "rgb.txt", folder / "depth.txt", max_difference)
+    frames = tuple(Frame(rgb.t, rgb.stamp, rgb.image, depth.image) for rgb, depth in pairs)
+    return Sequence(folder, frames, alone)
+
+
+def read_pairs(first: Path, second: Path, max_difference: float) -> tuple[list[tuple[Entry, Entry]], int]:
+    """Two lists paired as read_sequence does, and how many of the first stay alone. Raises DataError as it does."""
+    ours, theirs = _read_list(first), _read_list(second)
+    times = np.array([entry.t for entry in ours]), np.array([entry.t for entry in theirs])
+    pairs = [(ours[i], theirs[j]) for i, j in associate(*times, max_difference).tolist()]
     if not pairs:
-        raise DataError(f"{folder}: no image of rgb.txt lies within {max_difference:g} s of one of depth.txt")
-    frames = tuple(
-        Frame(c.t, d.t, c.stamp, folder / c.name, folder / d.name)
-        for c, d in ((colours[i], depths[j]) for i, j in pairs)
-    )
-    return Sequence(folder, frames, len(colours) - len(frames))
+        message = f"no image of {first.name} lies within {max_difference:g} s of one of {second.name}"
+        raise DataError(f"{first.parent}: {message}")
+    return pairs, len(ours) - len(pairs)
 
 
 def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
@@ -106,29 +110,38 @@ def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
         raise DataError(f"{path}: image is {found}, the camera says {expected}")
 
 
-def _read_list(path: Path) -> list[_Entry]:
+def _read_list(path: Path) -> list[Entry]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read; a TUM sequence has rgb.txt and depth.txt ({error})") from error
-    entries: list[_Entry] = []
+        layout = "a TUM sequence has rgb.txt and depth.txt, a stereo one left.txt and right.txt"
+        raise DataError(f"{path}: cannot be read; {layout} ({error})") from error
+    entries: list[Entry] = []
     for number, line in enumerate(lines, start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+        entry = read_entry(path, number, line)
+        if entry is None:
             continue
-        if len(words) != 2:
-            raise DataError(f"{path}:{number}: expected 'timestamp filename', found {len(words)} words")
-        try:
-            stamp = float(words[0])
-        except ValueError as error:
-            raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not a number") from error
-        if not math.isfinite(stamp):
-            raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not finite")
-        if entries and stamp <= entries[-1].t:
-            raise DataError(f"{path}:{number}: time stamp {words[0]} does not come after {entries[-1].stamp}")
-        if not (path.parent / words[1]).is_file():
-            raise DataError(f"{path}:{number}: {words[1]} does not exist in {path.parent}")
-        entries.append(_Entry(stamp, words[0], words[1]))
+        if entries and entry.t <= entries[-1].t:
+            raise DataError(f"{path}:{number}: time stamp {entry.stamp} does not come after {entries[-1].stamp}")
+        if not entry.image.is_file():
+            raise DataError(f"{path}:{number}: {line.split()[1]} does not exist in {path.parent}")
+        entries.append(entry)
     if not entries:
         raise DataError(f"{path}: lists no image")
     return entries
+
+
+def read_entry(path: Path, number: int, line: str) -> Entry | None:
+    """A line of the list `path`; None for a comment and a blank one. Raises DataError naming file and line."""
+    words = line.split()
+    if not words or words[0].startswith("#"):
+        return None
+    if len(words) != 2:
+        raise DataError(f"{path}:{number}: expected 'timestamp filename', found {len(words)} words")
+    try:
+        stamp = float(words[0])
+    except ValueError as error:
+        raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not a number") from error
+    if not math.isfinite(stamp):
+        raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not finite")
+    return Entry(stamp, words[0], path.parent / words[1])

@@ -49,7 +49,7 @@ def room(seed: int = 0) -> list[Rectangle]:
     ]
 
 
-def passer_by(step: int, seed: int = 7) -> Rectangle:
+def passer_by(step: float, seed: int = 7) -> Rectangle:
     """A textured board before the camera that goes along with step: the worst kind of mover, full of corners."""
     left = -1.0 + 0.03 * step
     return Rectangle(
@@ -62,9 +62,9 @@ def _board(seed: int) -> NDArray[np.uint8]:
     return texture(np.random.default_rng(seed), 300, 140, patches=400)
 
 
-def camera_path(frames: int) -> NDArray[np.float64]:
-    """[frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees."""
-    s = np.arange(frames) / 60.0 * 2 * np.pi
+def camera_path(frames: int, later: float = 0.0) -> NDArray[np.float64]:
+    """[frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees, from `later` frames on."""
+    s = (np.arange(frames) + later) / 60.0 * 2 * np.pi
     xi = np.stack([0.25 * np.sin(s), 0.1 * np.sin(2 * s), 0.12 * (1 - np.cos(s))], axis=1)
     turn = np.stack([0.04 * np.sin(s), 0.08 * (1 - np.cos(s)), 0.05 * np.sin(2 * s)], axis=1)
     return exp_se3(np.concatenate([xi, turn], axis=1))
@@ -101,12 +101,13 @@ def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> P
     """A TUM folder of the room with masks/, camera.yaml and groundtruth.txt; 30 frames/s, depth 5 ms after colour."""
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir(parents=True)
-    poses, rectangles = camera_path(frames), room()
     rows: dict[str, list[str]] = {"rgb": [], "depth": []}
-    for index, pose in enumerate(poses):
-        rgb, depth, moving = render([*rectangles, passer_by(index)] if with_passer_by else rectangles, pose)
-        stamp = f"{100 + index / 30:.6f}"
-        later = f"{100.005 + index / 30:.6f}"
+    poses, lag = camera_path(frames), 0.005 * 30
+    for index, (pose, late) in enumerate(zip(poses, camera_path(frames, lag), strict=True)):
+        boards = [(passer_by(index), passer_by(index + lag))] if with_passer_by else []
+        rgb, _, moving = render([*room(), *(now for now, _ in boards)], pose)
+        depth = render([*room(), *(then for _, then in boards)], late)[1]
+        stamp, later = f"{100 + index / 30:.6f}", f"{100.005 + index / 30:.6f}"
         cv2.imwrite(str(folder / "rgb" / f"{stamp}.png"), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
         cv2.imwrite(str(folder / "depth" / f"{later}.png"), (depth * 5000).round().astype(np.uint16))
         cv2.imwrite(str(folder / "masks" / f"{stamp}.png"), moving.astype(np.uint8) * 255)

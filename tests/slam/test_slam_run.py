@@ -56,7 +56,7 @@ def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
 
 def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequence: Path) -> None:
     names = {path.name for path in masked.iterdir()}
-    assert names == {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", "pictures"}
+    assert names == {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", "map.ply", "map.png", "pictures"}
     assert [path.name for path in masked.parent.iterdir()] == ["run"], "no temporary folder is left"
     trajectory, truth = read_tum(masked / "trajectory.txt"), read_tum(sequence / "groundtruth.txt")
     np.testing.assert_array_equal(trajectory.stamps, truth.stamps)
