@@ -139,7 +139,7 @@ class _Stage:
         """A cart, and who pushes it."""
         body, looks = furniture.cart(self.rng)
         line = walks.errands(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
-        way, behind = walks.rolled(self.rng, self.times, line, furniture.HANDLE - 0.28)
+        way, behind = walks.rolled(self.rng, self.times, line, furniture.HANDLE - 0.5)
         ways = [walk.moved(0.0, distance + _EYE_Y) for walk in (way, behind)]
         return [*(Walker(person, ways[1], pushes=True) for person in pusher), Thing(body, looks, ways[0])]
 
