@@ -33,7 +33,9 @@ def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
     looks = (_metal(rng), carton(rng, _SIDE, _SIDE), poster(rng, _SIDE, _SIDE), carton(rng, _SIDE, _SIDE))
     parts = [solids.box((0, 0, 0.2), (1.0, 0.6, 0.05), 0, 0, 0)]
     for x in (-0.4, 0.4):
-        parts += [solids.capsule((x, y - 0.02, 0.09), (x, y + 0.02, 0.09), (0.08, 0.08), _UPRIGHT, 0) for y in (-0.25, 0.25)]
+        parts += [
+            solids.capsule((x, y - 0.02, 0.09), (x, y + 0.02, 0.09), (0.08, 0.08), _UPRIGHT, 0) for y in (-0.25, 0.25)
+        ]
     parts += [solids.box((HANDLE, y, 0.62), (0.04, 0.04, 0.84), 0, 0, 0) for y in (-0.27, 0.27)]
     parts.append(solids.box((HANDLE, 0, 1.04), (0.04, 0.58, 0.04), 0, 0, 0))
     low, high = float(rng.uniform(0.55, 0.65)), float(rng.uniform(0.45, 0.58))

@@ -27,7 +27,13 @@ PEAK = 0.62  # share that no frame should exceed
 EMPTY = 0.2  # share of the frames that may show next to nobody
 _COARSE_BIAS = 0.87  # exact over coarse share: pixels touched by a point count as whole ones
 _DRAWS = 24  # how often the ways are drawn anew to get there
-_REACH = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}  # m beyond the view where people turn
+_REACH = {
+    "xyz": 0.75,
+    "halfsphere": 1.2,
+    "static": 0.6,
+    "rpy": 1.2,
+    "loop": 0.75,
+}  # m beyond the view where people turn
 _EYE_Y = 0.9  # m from the wall behind the camera
 
 
@@ -63,13 +69,15 @@ class Setting:
 class Scene:
     """Everything a sequence shows, as functions of the frame number.
 
-    truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own.
+    truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own; metered: frames whose brightness
+    sets the exposure of all.
     """
 
     room: Room
     actors: tuple[Actor, ...]
     camera: Camera
     truth: Doubles
+    metered: tuple[int, ...] = (0,)
 
     @property
     def poses(self) -> Doubles:
@@ -162,10 +170,11 @@ def draw_scene(
     cast = [bodies.draw_person(rng, patterned=1.0) for _ in range(people)]
     stage = _Stage(rng, fine[::TRUTH_PER_FRAME], truth[::TRUTH_PER_FRAME], motion)
     nobody = people == 0 and setting.cart == "none"
+    metered = tuple(k * frames // 5 for k in range(5)) if motion == "loop" else (0,)
     fitted = not nobody and setting.action != "fill_view"
 
     def draw(nearest: float) -> Scene:
-        return Scene(room, _actors(stage, setting, cast, nearest), Camera.freiburg3(size), truth)
+        return Scene(room, _actors(stage, setting, cast, nearest), Camera.freiburg3(size), truth, metered)
 
     return _fitted(draw, people) if fitted else draw(1.3)
 

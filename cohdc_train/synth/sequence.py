@@ -99,7 +99,7 @@ def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[Doubles, Doubl
         (folder / name).mkdir()
     rng = stream(seed, "sequence", 2)
     atlas, frames = scene.atlas(), len(scene.poses)
-    gain = np.float32(exposure(scene.view(0, atlas).rgb))
+    gain = np.float32(np.mean([exposure(scene.view(k, atlas).rgb) for k in scene.metered]))
     shares = []
     for k, stamp in enumerate(stamps(frames)):
         view = scene.view(k, atlas)

@@ -188,5 +188,3 @@ def approach(times: Doubles, poses: Doubles) -> Walk:
     walk = walk_along(times, poses[:, :2, 3] + away[:, None] * forward + aside[:, None] * right, 0.0)
     azimuth = np.arctan2(forward[:, 1], forward[:, 0])
     return replace(walk, heading=azimuth + np.interp(t, [0.66, 0.76], [np.pi, 0.0]))
-
-
