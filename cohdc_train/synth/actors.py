@@ -97,9 +97,13 @@ class Sitter:
         pose = bodies.sitting(float(self.fidget[frame]), float(self.gesture[frame]))
         return bodies.person_mesh(self.person, pose, self.place, self.heading)
 
+    @cached_property
+    def _figure(self) -> Doubles:
+        return scattered(self.mesh(0))
+
     def points(self, frame: int) -> Doubles:
-        """The seated person."""
-        return scattered(self.mesh(frame))
+        """The seated person, whose fidgeting is no matter here."""
+        return self._figure
 
 
 @dataclass(frozen=True)

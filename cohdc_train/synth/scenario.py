@@ -129,19 +129,20 @@ class _Stage:
 
     def seated(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
         """People side by side on chairs, turned to the camera more or less."""
-        actors: list[Actor] = []
+        sitters: list[Actor] = []
         chairs: list[Actor] = []
+        still = np.zeros(len(self.times))
         sides = np.linspace(-0.38, 0.38, len(people)) if len(people) > 1 else np.zeros(1)
         for person, side, distance in zip(people, self.rng.permutation(sides), distances, strict=True):
             place = (float(side * distance), float(distance + _EYE_Y))
             heading = float(np.arctan2(-1.0, -side) + self.rng.uniform(-0.7, 0.7))
             fidget = sway(self.rng, self.times, 1.0, 3.0)
             gesture = np.clip(4 * sway(self.rng, self.times, 1.0, 6.0) - 3, 0, 1)
-            actors.append(Sitter(person, place, heading, fidget, gesture))
-            seat = bodies.seat_height(person, bodies.sitting(0.0, 0.0))
-            rest = Walk(np.tile(place, (len(self.times), 1)), np.full(len(self.times), heading), *[0 * self.times] * 2)
-            chairs.append(Thing(furniture.chair(seat), (furniture.chair_texture(self.rng),), rest))
-        return [*actors, *chairs]
+            sitters.append(Sitter(person, place, heading, fidget, gesture))
+            chair = furniture.chair(bodies.seat_height(person, bodies.sitting(0.0, 0.0)))
+            rest = Walk(np.tile(place, (len(still), 1)), still + heading, still, still)
+            chairs.append(Thing(chair, (furniture.chair_texture(self.rng),), rest))
+        return [*sitters, *chairs]
 
     def rolling(self, pusher: list[bodies.Person], distance: float) -> list[Actor]:
         """A cart, and who pushes it."""
