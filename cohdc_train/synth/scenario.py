@@ -27,13 +27,8 @@ PEAK = 0.62  # share that no frame should exceed
 EMPTY = 0.2  # share of the frames that may show next to nobody
 _COARSE_BIAS = 0.87  # exact over coarse share: pixels touched by a point count as whole ones
 _DRAWS = 24  # how often the ways are drawn anew to get there
-_REACH = {
-    "xyz": 0.75,
-    "halfsphere": 1.2,
-    "static": 0.6,
-    "rpy": 1.2,
-    "loop": 0.75,
-}  # m beyond the view where people turn
+# m beyond the view's border where people turn
+_REACH = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}
 _EYE_Y = 0.9  # m from the wall behind the camera
 
 

@@ -1,4 +1,4 @@
-"""`cohdc synth sequence`: an RGB-D sequence of people walking through a room, in TUM's layout, with its truth."""
+"""`cohdc synth sequence`: an RGB-D sequence of people in a room, in TUM's layout, with its truth."""
 
 import json
 from dataclasses import asdict

@@ -106,8 +106,8 @@ def test_a_cart_is_pushed_across_the_view_and_changes_the_depth_there() -> None:
 def test_who_stops_does_not_move_at_all_and_then_goes() -> None:
     scene = scene_of("xyz", 2, action="stop_and_go")
     for actor in scene.actors:
-        speed = np.array([fastest(actor, k, FRAMES, 30) for k in range(FRAMES)])
-        assert np.all(speed[:12] == 0)
+        speed = np.array([fastest(actor, k, FRAMES, 30) for k in range(0, FRAMES, 6)])
+        assert np.all(speed[:3] == 0)
         assert speed.max() > 0.5
 
 
@@ -177,11 +177,11 @@ def test_people_of_a_loop_cross_its_view_and_keep_off_the_walls(loop: Scene) -> 
 )
 def test_same_seed_same_bytes(tmp_path: Path, options: dict[str, object]) -> None:
     def digests(name: str, seed: int) -> dict[str, str]:
-        sequence(tmp_path / name, frames=3, size=SIZE, seed=seed, **options)  # type: ignore[arg-type]
+        sequence(tmp_path / name, frames=2, size=SIZE, seed=seed, **options)  # type: ignore[arg-type]
         files = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
         return {str(p.relative_to(tmp_path / name)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
-    first, again, other = digests("a", 3), digests("b", 3), digests("c", 4)
+    first, again, other = digests("a", 7), digests("b", 7), digests("c", 11)
     assert first == again
     assert all(first[name] != other[name] for name in first if name.startswith(("rgb/", "depth/")))
 
