@@ -15,7 +15,7 @@ class Mesh:
     """T triangles, nothing shared between them.
 
     corners, normals: [T, 3, 3] m and unit vectors, one frame; uv: [T, 3, 2] in 0..1, v downwards in the texture;
-    texture: [T] int32 index into a list of textures; instance: [T] int32, 0 = room, 1.. = person.
+    texture: [T] int32 index into a list of textures; instance: [T] int32, 0 = room, 1.. = whoever is in it.
     """
 
     corners: Floats

@@ -92,6 +92,25 @@ def walking(phase: float, vigour: float = 1.0) -> Pose:
     )
 
 
+def sitting(fidget: float, gesture: float) -> Pose:
+    """Seated, a hand on each thigh; fidget -1..1 sways trunk and head a little, gesture 0..1 lifts the right hand."""
+    return Pose(
+        hips=(1.45, 1.5),
+        knees=(1.5, 1.45),
+        shoulders=(0.42, 0.42 + 0.5 * gesture),
+        elbows=(0.75, 0.75 + 0.6 * gesture),
+        spread=(0.1, 0.1),
+        lean=0.06 + 0.012 * fidget,
+        nod=0.03 * fidget,
+    )
+
+
+def seat_height(person: Person, pose: Pose) -> float:
+    """Height above the floor of what a seated person's thighs rest on, m."""
+    soles = [_leg(person, side, hip, knee)[1] for side, hip, knee in zip((1, -1), pose.hips, pose.knees, strict=True)]
+    return -min(soles) - 0.05 * person.height * person.girth
+
+
 def draw_pose(rng: np.random.Generator) -> Pose:
     """A random moment: half of them walking, the others standing, gesturing or reaching."""
     kind = rng.random()

@@ -61,12 +61,16 @@ class _Builder:
         maker = textures.FACES[int(self.rng.integers(len(textures.FACES)))]
         return self.add_texture(maker(self.rng, self.detail // 4, self.detail // 4))
 
-    def shell(self) -> None:
-        """Floor, ceiling and four walls, each with a texture of its own, darker towards the corners."""
+    def shell(self, plain: bool = False) -> None:
+        """Floor, ceiling and four walls, each with a texture of its own, darker towards the corners.
+
+        plain: walls of even paint, without a mark.
+        """
         w, length, h = self.size
         rng, d = self.rng, self.detail
         floor = textures.FLOORS[int(rng.integers(len(textures.FLOORS)))]
         walls = [textures.WALLS[int(k)] for k in rng.permutation(len(textures.WALLS))[:4]]
+        walls = [textures.paint] * 4 if plain else walls
         low, high = _cornered(floor(rng, d, d)), _cornered(textures.plaster(rng, d // 2, d // 2))
         sides = [self.add_texture(_cornered(maker(rng, d // 2, d))) for maker in walls]
         self.floor = self.add_texture(low)
@@ -79,25 +83,27 @@ class _Builder:
             solids.quad((w / 2, length, h), (0, -length, 0), (0, 0, -h), sides[3]),
         ]
 
-    def pictures(self) -> None:
-        """Posters on the far wall and on both side walls."""
+    def pictures(self, walls: int = 3) -> None:
+        """Posters on the far wall, on both side walls and, of four `walls`, on the near one."""
         w, length, h = self.size
-        for wall in range(3):
-            span = w if wall == 0 else length
+        for wall in range(walls):
+            span = w if wall in (0, 3) else length
             for x in np.arange(0.7, span - 0.7, self.rng.uniform(0.9, 1.5)):
                 if self.rng.random() < 0.2:
                     continue
                 wide, tall = self.rng.uniform(0.4, 0.8), self.rng.uniform(0.4, 0.9)
                 z = self.rng.uniform(1.2, max(h - tall / 2 - 0.25, 1.25)) + tall / 2
-                side = self.detail // 2 if wall == 0 else self.detail // 4
+                side = self.detail // 2 if wall in (0, 3) else self.detail // 4
                 look = self.add_texture(textures.poster(self.rng, side, side))
                 left = x - wide / 2 + self.rng.uniform(-0.15, 0.15)
                 if wall == 0:
                     part = solids.quad((left - w / 2, length - 0.02, z), (wide, 0, 0), (0, 0, -tall), look)
                 elif wall == 1:
                     part = solids.quad((0.02 - w / 2, left, z), (0, wide, 0), (0, 0, -tall), look)
-                else:
+                elif wall == 2:
                     part = solids.quad((w / 2 - 0.02, left + wide, z), (0, -wide, 0), (0, 0, -tall), look)
+                else:
+                    part = solids.quad((left + wide - w / 2, 0.02, z), (-wide, 0, 0), (0, 0, -tall), look)
                 self.parts.append(part)
 
     def shelf(self, x: float, y: float, yaw: float) -> None:
@@ -176,6 +182,20 @@ class _Builder:
         ambient = self.rng.uniform(0.4, 0.7) * (1 + self.rng.normal(0, 0.03, 3))
         return Lighting(lamps.astype(np.float32), power.astype(np.float32), ambient.astype(np.float32))
 
+    def line_sides(self, first: float) -> None:
+        """Furniture along both side walls from y = `first` m on."""
+        w, length, _ = self.size
+        for side in (-1, 1):
+            for y in np.arange(first, length - 0.9, 1.2):
+                kind = (self.shelf, self.carton)[int(self.rng.integers(2))]
+                kind(side * (w / 2 - 0.35), float(y), np.pi / 2)
+
+    def room(self) -> Room:
+        """What has been built, with shadows under it and lamps above."""
+        footprints = np.array(self.footprints, dtype=np.float32).reshape(-1, 4)
+        _shade_floor(self.textures[self.floor], footprints, self.size)
+        return Room(self.size, solids.join(self.parts), tuple(self.textures), self.lighting(), footprints)
+
 
 def _cornered(image: Texture) -> Texture:
     """The texture darkened towards its border, as corners of a room are."""
@@ -213,13 +233,33 @@ def furnished_room(
         y = length - rng.uniform(1.4, 1.9)
         if y > walk_depth + 0.5 and rng.random() < 0.7:
             (build.table, build.carton)[int(rng.integers(2))](float(x), y, rng.uniform(-0.5, 0.5))
-    for side in (-1, 1):
-        for y in np.arange(max(walk_depth - 0.4, 0.8), length - 0.9, 1.2):
-            kind = (build.shelf, build.carton)[int(rng.integers(2))]
-            kind(side * (w / 2 - 0.35), float(y), np.pi / 2)
-    footprints = np.array(build.footprints, dtype=np.float32).reshape(-1, 4)
-    _shade_floor(build.textures[build.floor], footprints, size)
-    return Room(size, solids.join(build.parts), tuple(build.textures), build.lighting(), footprints)
+    build.line_sides(max(walk_depth - 0.4, 0.8))
+    return build.room()
+
+
+def round_room(rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024) -> Room:
+    """Draw a room with furniture and pictures along all four walls and a free middle; arguments as `furnished_room`."""
+    build = _Builder(rng, size, detail)
+    build.shell()
+    build.pictures(walls=4)
+    w, length, _ = size
+    for y, yaw in ((length - 0.4, 0.0), (0.4, np.pi)):
+        for x in np.arange(-w / 2 + 0.6, w / 2 - 0.5, 1.25):
+            kind = (build.shelf, build.table, build.carton)[int(rng.integers(3))]
+            kind(float(x + rng.uniform(-0.1, 0.1)), y, yaw + rng.normal(0, 0.04))
+    build.line_sides(1.3)
+    return build.room()
+
+
+def plain_room(rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024) -> Room:
+    """Draw a room of plain walls with little before them; arguments as `furnished_room`."""
+    build = _Builder(rng, size, detail)
+    build.shell(plain=True)
+    w, length, _ = size
+    for x in (-w / 2 + rng.uniform(0.9, 1.6), w / 2 - rng.uniform(0.9, 1.6)):
+        kind = (build.table, build.carton)[int(rng.integers(2))]
+        kind(float(x), length - 0.5, rng.normal(0, 0.04))
+    return build.room()
 
 
 def _shade_floor(floor: Texture, footprints: NDArray[np.float32], size: tuple[float, float, float]) -> None:

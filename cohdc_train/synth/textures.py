@@ -56,6 +56,11 @@ def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
     return finish(image, rng, 7, 12)
 
 
+def paint(rng: np.random.Generator, height: int, width: int) -> Texture:
+    """A freshly painted wall: one colour, next to no grain."""
+    return finish(flat(height, width, colour(rng, 150, 225)), rng, 0.8, 0.0)
+
+
 def brick(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Bricks in mortar, every brick with a shade of its own."""
     rows = int(rng.integers(14, 24))

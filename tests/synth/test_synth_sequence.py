@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from cohdc_train.errors import DataError
 from cohdc_train.synth import sequence
 from cohdc_train.synth.renderer import render
-from cohdc_train.synth.sequence import draw_scene
+from cohdc_train.synth.scenario import draw_scene
 
 pytest.importorskip("embreex")
 
@@ -38,9 +38,9 @@ def rows(path: Path) -> list[list[str]]:
 def test_layout(folder: Path) -> None:
     names = {p.name for p in folder.iterdir()}
     assert names == {
-        *("rgb", "depth", "masks", "rgb.txt", "depth.txt", "groundtruth.txt", "camera.yaml", "info.json"),
+        *("rgb", "depth", "masks", "movers", "rgb.txt", "depth.txt", "groundtruth.txt", "camera.yaml", "info.json"),
     }
-    for kind, dtype in (("rgb", np.uint8), ("depth", np.uint16), ("masks", np.uint8)):
+    for kind, dtype in (("rgb", np.uint8), ("depth", np.uint16), ("masks", np.uint8), ("movers", np.uint8)):
         files = sorted((folder / kind).iterdir())
         assert len(files) == FRAMES
         image = cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED)
@@ -171,7 +171,7 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
         ({"size": (480, 12)}, "size: 480 x 12 px"),
         ({"seed": -1}, "seed: -1"),
         ({"motion": "spiral"}, "motion: 'spiral'"),
-        ({"people": 9}, "people: 9"),
+        ({"people": 13}, "people: 13"),
     ],
 )
 def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
