@@ -4,20 +4,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera, choose_camera
 from cohdc_train.slam.culling import Culling, FolderMasks, MaskSource, ModelMasks, no_masks
-from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.method import Method
+from cohdc_train.slam.realtime import workers
 from cohdc_train.slam.results import (
     FrameRecord,
     check_out,
@@ -46,6 +48,7 @@ def slam(
     features: int = 1000,
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
     method: Method = Method(),  # noqa: B008 - the same
+    realtime: bool = False,
 ) -> dict[str, Any]:
     """Track an RGB-D camera through a TUM-format sequence; people are removed when masks or a model are given.
 
@@ -62,6 +65,8 @@ def slam(
         features: corners per frame.
         culling: how masks are made.
         method: which parts of the method run.
+        realtime: frames come at the pace of their stamps, one that is late is dropped and counted; masks and mapping
+            are made beside tracking. Then the numbers depend on the machine.
     """
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
@@ -70,25 +75,26 @@ def slam(
     check_out(out)
     intrinsics, origin = choose_camera(sequence, camera)
     source = Recorded(sequence, intrinsics)
-    mask_of = _mask_source(model, masks, intrinsics, culling)
+    maker = _masks(model, masks, intrinsics, culling, 1 if realtime else 0)
     print(f"camera: {origin}")
     print(f"sequence: {len(source)} pairs; {source.without_depth} colour images have no depth image and are left out")
     options = {"model": model, "masks": masks, "sequence": sequence, "seed": seed, "features": features}
     config: dict[str, Any] = {key: str(v) if isinstance(v, Path) else v for key, v in options.items()}
-    config |= {
-        "culling": asdict(culling),
-        "method": asdict(method),
-        "camera": intrinsics.as_dict(),
-        "camera_origin": origin,
-    }
-    config |= {"version": __version__}
-    with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+    config |= {"culling": asdict(culling), "method": asdict(method), "realtime": realtime}
+    config |= {"camera": intrinsics.as_dict(), "camera_origin": origin, "version": __version__}
+    with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder, ExitStack() as s:
         part = Path(folder)
-        tracker = Tracker(intrinsics, features, seed, method)
-        records = _run(tracker, source, mask_of, part)
+        beside = s.enter_context(workers(source, maker)) if realtime else None
+        if beside is None:
+            tracker = Tracker(intrinsics, features, seed, method)
+            records = _run(tracker, source, maker or no_masks, part)
+        else:
+            tracker = Tracker(intrinsics, features, seed, method, beside.executor)
+            records = _run(tracker, beside.source, beside.mask_of, part)
         trajectory = Trajectory(*tracker.trajectory())
-        metrics = {"seed": seed, "without_depth": source.without_depth}
-        metrics |= measure(records, trajectory, source.groundtruth)
+        metrics = {"seed": seed, "realtime": realtime, "without_depth": source.without_depth}
+        metrics |= measure(records, trajectory, source.groundtruth, 0 if beside is None else beside.source.dropped)
+        metrics |= {} if beside is None else beside.metrics()
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
     print(summary(metrics))
@@ -103,46 +109,71 @@ def summary(metrics: dict[str, Any]) -> str:
         ("keyframes", str(metrics["keyframes"])),
         ("frames/s", f"{metrics['fps']:.1f}"),
     ]
-    rows += [(f"{stage} ms", f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for stage, q in metrics["ms"].items()]
+    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
+    if metrics["realtime"]:
+        rows.append(("dropped", str(metrics["dropped"])))
+        names = {"segmenter_ms": "segmenter ms", "mask_age_ms": "mask age ms", "latency_ms": "latency ms"}
+        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
+    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
     for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
         if key in metrics:
             rows.append((key, "  ".join(f"{name} {value:.4f}" for name, value in metrics[key].items())))
     return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
-def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:
+def _masks(
+    model: Path | None, masks: Path | None, camera: Camera, culling: Culling, threads: int
+) -> FolderMasks | ModelMasks | None:
     if masks is not None:
         return FolderMasks(masks, camera, culling)
     if model is None:
-        return no_masks
+        return None
     from cohdc_train.segmenter import Segmenter
 
-    return ModelMasks(Segmenter(model), culling)
+    return ModelMasks(Segmenter(model, threads), culling)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """What is drawn of a frame when the run is over, so that no time of the run goes into it."""
+
+    view: View
+    mask: NDArray[np.bool_] | None
+    features: Features
 
 
 def _run(tracker: Tracker, source: Source, mask_of: MaskSource, part: Path) -> list[FrameRecord]:
-    (part / "pictures").mkdir()
     count = len(source)
     pictured = set(np.linspace(0, count - 1, min(_PICTURES, count)).round().astype(int).tolist())
-    records = []
+    records: list[FrameRecord] = []
+    pictures = []
     for index, view in enumerate(source):
-        records.append(_step(tracker, view, mask_of, part / "pictures" if index in pictured else None))
-        _progress(index + 1, count, records[-1])
+        record, mask = _step(tracker, view, mask_of)
+        records.append(record)
+        if index in pictured and tracker.features is not None:
+            pictures.append(_Picture(view, mask, tracker.features))
+        _progress(index + 1, count, record)
+    tracker.finish()
+    (part / "pictures").mkdir()
+    for picture in pictures:
+        _draw(picture, FeatureExtractor(tracker.camera, tracker.budget), part / "pictures")
     return records
 
 
-def _step(tracker: Tracker, view: View, mask_of: MaskSource, pictures: Path | None) -> FrameRecord:
-    """One frame; when it is to be pictured, the drawing stays outside the measured time."""
+def _step(tracker: Tracker, view: View, mask_of: MaskSource) -> tuple[FrameRecord, NDArray[np.bool_] | None]:
     start = time.perf_counter()
     mask = mask_of(view)
     segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
     pose = tracker.track(view.rgb, view.depth, view.t, mask)
-    if pictures is not None and tracker.features is not None:
-        unmasked = FeatureExtractor(tracker.camera, tracker.budget)(view.rgb, view.depth)
-        write_jpeg(pictures / f"{view.stamp}_before.jpg", draw_before(view.rgb, unmasked, mask))
-        if mask is not None:
-            write_jpeg(pictures / f"{view.stamp}_after.jpg", draw_after(view.rgb, tracker.features, mask))
-    return FrameRecord(view.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms)
+    return FrameRecord(view.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms), mask
+
+
+def _draw(picture: _Picture, extract: FeatureExtractor, folder: Path) -> None:
+    view, mask = picture.view, picture.mask
+    before = draw_before(view.rgb, extract(view.rgb, view.depth), mask)
+    write_jpeg(folder / f"{view.stamp}_before.jpg", before)
+    if mask is not None:
+        write_jpeg(folder / f"{view.stamp}_after.jpg", draw_after(view.rgb, picture.features, mask))
 
 
 def _progress(done: int, count: int, record: FrameRecord) -> None:

@@ -1,12 +1,14 @@
 """The tracker: every frame's pose against the map; decides on keyframes; finds the place again after a loss."""
 
 import time
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.map import Keyframe, Map, observations
@@ -50,9 +52,19 @@ class _Fit:
 
 
 class Tracker:
-    """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit."""
+    """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit.
 
-    def __init__(self, camera: Camera, features: int = 1000, seed: int = 0, method: Method | None = None) -> None:
+    With an executor bundle adjustment runs there, beside tracking (`background_mapping`); poses then depend on time.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        features: int = 1000,
+        seed: int = 0,
+        method: Method | None = None,
+        executor: Executor | None = None,
+    ) -> None:
         self.camera = camera
         self.method = method or Method()
         self.map = Map(camera)
@@ -60,6 +72,7 @@ class Tracker:
         self.features: Features | None = None  # of the latest frame
         self._extract = FeatureExtractor(camera, features)
         self._weighing = Weighing(camera)
+        self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._rng = np.random.default_rng(seed)
         self._velocity = np.eye(4)
         self._last: _Fit | None = None
@@ -78,6 +91,7 @@ class Tracker:
         a pose, the whole picture is matched against the map, whose points stand still; such a frame is no keyframe.
         """
         start = time.perf_counter()
+        self._take_in_mapping()
         features = self._extract(rgb, depth_m, mask)
         fit = self._locate(features, rgb)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
@@ -94,6 +108,11 @@ class Tracker:
         mapped = time.perf_counter()
         T_wc = None if fit is None else np.linalg.inv(fit.T_cw).astype(np.float64)
         return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
+
+    def finish(self) -> None:
+        """Wait for mapping that runs beside tracking; the trajectory is better for it."""
+        if self._mapper is not None:
+            self._mapper.finish(self.map)
 
     def trajectory(self) -> tuple[Array, Array]:
         """All tracked frames, each re-derived from its reference keyframe as the map has it now.
@@ -115,6 +134,12 @@ class Tracker:
         if rough is None:
             return self._relocalise(features, rgb)
         return self._against_local_map(features, rough, _MIN_TRACKED)
+
+    def _take_in_mapping(self) -> None:
+        """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
+        motion = None if self._mapper is None else self._mapper.collect(self.map)
+        if motion is not None and self._last is not None:
+            self._last = _Fit(self._last.T_cw @ motion, self._last.matches)
 
     def _follow(self, features: Features, last: _Fit) -> _Fit | None:
         """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
@@ -179,7 +204,7 @@ class Tracker:
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
         keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, thumbnail(rgb))
-        insert_keyframe(self.map, keyframe, self._weighing)
+        insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
         self._reference = keyframe
         self._since_keyframe = 0
         self._reference_inliers = 0
