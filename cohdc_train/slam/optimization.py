@@ -166,4 +166,7 @@ def _refine(T_cw: Array, points: Array, seen: Observations, weighing: Weighing, 
         T_cw = exp_se3(step) @ T_cw
         if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
             break
+    # A pose is predicted from the two before, which doubles what rounding took from its rotation; one Newton step back.
+    R = T_cw[:3, :3]
+    T_cw[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)
     return T_cw

@@ -116,13 +116,14 @@ def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
 def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
     """Give the band about a mask's edge to what it is as deep as.
 
-    mask: [h, w]; depth: [h, w] m, 0 = no reading: such pixels stay as they are. Returns [h, w].
+    mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, or without the mask's inside nearby to compare
+    with, stay as they are. Returns [h, w].
     """
-    inside = (mask & (depth > 0)).astype(np.float32)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
+    filled = mask.astype(np.uint8)
+    inside = ((cv2.erode(filled, disc) > 0) & (depth > 0)).astype(np.float32)
     size = (_NEARBY, _NEARBY)
     share, sums = cv2.boxFilter(inside, -1, size), cv2.boxFilter(inside * depth, -1, size)
-    own = sums / np.maximum(share, np.float32(1e-6))
-    alike = (share > 1e-4) & (depth > 0) & (np.abs(depth - own) < _GATE)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
-    grown = cv2.dilate(mask.astype(np.uint8), disc) > 0
-    return np.asarray((grown & alike) | (mask & (depth <= 0)))
+    known = (share > 1e-4) & (depth > 0)
+    alike = np.abs(depth * share - sums) < _GATE * share
+    return np.asarray(np.where(known, alike & (cv2.dilate(filled, disc) > 0), mask))
