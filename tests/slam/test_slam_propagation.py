@@ -14,7 +14,7 @@ _SHIRT = texture(np.random.default_rng(2), 100, 80, patches=200)
 
 
 def scene(left: int, depth: float = PERSON) -> tuple[Half, Mask]:
-    """A textured board, 80 x 100 px with its left edge at `left`, before a wall. Returns the frame and the true mask."""
+    """A textured board, 80 x 100 px, its left edge at `left`, before a wall. Returns the frame and the true mask."""
     rgb, metres = _WALLPAPER.copy(), np.full((HEIGHT, WIDTH), WALL, dtype=np.float32)
     mask = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
     begin, end = max(left, 0), min(left + 80, WIDTH)
