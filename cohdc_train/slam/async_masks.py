@@ -41,9 +41,9 @@ class _Done:
 class AsyncMasks:
     """A mask for every frame from a segmenter that keeps up with only some.
 
-    outline: view -> mask [H, W], True = dynamic, and by how many px it is to grow. It runs in a thread, always on the
-    newest frame; of those that come while it is busy, one waits and a newer one takes its place. Only the first frame
-    waits for its mask. The older a mask is, the wider it is made. Use inside `with`.
+    outline: view -> mask [H, W], True = dynamic, and by how many px it is to grow. It runs in a thread, on the newest
+    frame whenever it is free; those that come while it is busy are not kept for it, for a fresher one comes soon. Only
+    the first frame waits for its mask. The older a mask is, the wider it is made. Use inside `with`.
 
     ages: s, per frame, from the frame its mask was made of; segment_ms: time of each mask in the worker.
     """
@@ -55,6 +55,7 @@ class AsyncMasks:
         self._propagation = Propagation()
         self._jobs: Slot[_Job] = Slot()
         self._results: Slot[_Done] = Slot()
+        self._busy = False
         self._newest: _Done | None = None
         self._worker = threading.Thread(target=self._work, name="segmenter", daemon=True)
 
@@ -72,12 +73,13 @@ class AsyncMasks:
     def __call__(self, view: View) -> Mask:
         """[H, W] bool, True = dynamic. Views must come in the order of time; raises what the segmenter raised."""
         half = halve(view.rgb, view.depth)
-        self._jobs.put(_Job(self._propagation.advance(half), view, half))
-        done = self._results.take() if self._newest is None else self._results.poll()
-        if done is not None:
-            self._newest = done
-            self.segment_ms.append(done.ms)
-            self._propagation.renew(done.mask, done.job.number, done.job.half)
+        job = _Job(self._propagation.advance(half), view, half)
+        self._take(self._results.poll())
+        if not self._busy:
+            self._jobs.put(job)
+            self._busy = True
+        if self._newest is None:
+            self._take(self._results.take())
         mask, newest = self._propagation.mask(), self._newest
         assert mask is not None
         assert newest is not None
@@ -86,6 +88,13 @@ class AsyncMasks:
         height, width = view.rgb.shape[:2]
         grown = grow(mask, (newest.growth + _WIDEN * age) / 2).astype(np.uint8)
         return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+
+    def _take(self, done: _Done | None) -> None:
+        if done is None:
+            return
+        self._busy, self._newest = False, done
+        self.segment_ms.append(done.ms)
+        self._propagation.renew(done.mask, done.job.number, done.job.half)
 
     def _work(self) -> None:
         if sys.platform == "linux":

@@ -85,16 +85,13 @@ def slam(
     with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder, ExitStack() as s:
         part = Path(folder)
         beside = s.enter_context(workers(source, maker)) if realtime else None
-        if beside is None:
-            tracker = Tracker(intrinsics, features, seed, method)
-            records = _run(tracker, source, maker or no_masks, part)
-        else:
-            tracker = Tracker(intrinsics, features, seed, method, beside.executor)
-            records = _run(tracker, beside.source, beside.mask_of, part)
+        tracker = Tracker(intrinsics, features, seed, method, beside.executor if beside else None)
+        views, mask_of = (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
+        records = _run(tracker, views, mask_of, part)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "realtime": realtime, "without_depth": source.without_depth}
-        metrics |= measure(records, trajectory, source.groundtruth, 0 if beside is None else beside.source.dropped)
-        metrics |= {} if beside is None else beside.metrics()
+        metrics |= measure(records, trajectory, source.groundtruth, beside.source.dropped if beside else 0)
+        metrics |= beside.metrics() if beside else {}
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
     print(summary(metrics))
