@@ -49,6 +49,15 @@ class Camera:
         flat = cv2.undistortImagePoints(points, self.matrix(), coefficients, None, criteria)
         return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
 
+    def distort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """pixels: [n, 2] without distortion, px. Returns [n, 2] px where the lens puts them: undistort's inverse."""
+        coefficients = np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
+        if not coefficients.any() or len(pixels) == 0:
+            return np.asarray(pixels, dtype=np.float64).copy()
+        rays = self.backproject(pixels, np.ones(len(pixels))).reshape(-1, 1, 3)
+        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.matrix(), coefficients)
+        return np.asarray(bent, dtype=np.float64).reshape(-1, 2)
+
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """points: [..., 3] in the camera frame, m, z > 0. Returns [..., 2] undistorted px."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]

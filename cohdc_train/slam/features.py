@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.optimization import to_local
 
 SCALE = 1.2  # between two levels of the image pyramid
 LEVELS = 8
@@ -57,12 +58,20 @@ class FeatureExtractor:
         self.budget = budget
         self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]
         shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
+        self._scales = SCALE ** np.arange(LEVELS)
         self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
 
     def __call__(
-        self, rgb: NDArray[np.uint8], depth: NDArray[np.float32], mask: NDArray[np.bool_] | None = None
+        self,
+        rgb: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        mask: NDArray[np.bool_] | None = None,
+        lag: NDArray[np.float64] | None = None,
     ) -> Features:
-        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there."""
+        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there.
+
+        lag: [4, 4] from the camera's frame at the colour image's time to that at depth's, where they differ.
+        """
         gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found = self._detect(gray, allowed)
@@ -72,9 +81,29 @@ class FeatureExtractor:
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
+        pixels += 0.5 * (self._scales[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
+        points = self.camera.undistort(pixels)
         depths = sample_depth(depth, pixels, mask)
-        descriptors = np.ascontiguousarray(words).view(np.uint64)
-        return Features(pixels, self.camera.undistort(pixels), octaves, descriptors, depths)
+        if lag is not None:
+            depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
+        return Features(pixels, points, octaves, np.ascontiguousarray(words).view(np.uint64), depths)
+
+    def _caught_up(
+        self,
+        depth: NDArray[np.float32],
+        corners: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+        mask: NDArray[np.bool_] | None,
+        lag: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Depths at the colour image's time: read where each corner was when depth was taken, and carried back.
+
+        A hand moves a Kinect by half a centimetre in the 17 ms that its two images lie apart.
+        """
+        pixels, points, depths = corners
+        there = self.camera.project(to_local(lag, self.camera.backproject(points, depths)))
+        shift = np.nan_to_num(there - points)
+        moved = sample_depth(depth, pixels + shift, mask)
+        return to_local(np.linalg.inv(lag).astype(np.float64), self.camera.backproject(points + shift, moved))[:, 2]
 
     def _detect(self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None) -> Sequence[cv2.KeyPoint]:
         """Strong corners, which are quick to find; where they do not suffice, weak ones too."""

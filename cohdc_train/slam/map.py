@@ -13,6 +13,8 @@ from cohdc_train.slam.optimization import Array, Observations, to_local
 _NEAR = 0.1  # m
 _OBSERVERS = 8  # a point remembers by which keyframes it was seen last
 _NEIGHBOURS = 64  # keyframes that are looked at when those that share most points are sought
+_STILL = 3.0  # log-odds that a new point stands still
+_WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
 _VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
 
 
@@ -30,6 +32,7 @@ class Keyframe:
     features: Features
     point_ids: NDArray[np.int64]
     thumbnail: NDArray[np.float32]
+    nearest: NDArray[np.float32]
 
     def seen_points(self) -> NDArray[np.int64]:
         """Ids of the points this keyframe sees."""
@@ -40,9 +43,9 @@ class Keyframe:
         return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
 
 
-def observations(features: Features, corners: NDArray[np.int64]) -> Observations:
-    """What a frame measured at some of its corners."""
-    return Observations(features.points[corners], features.depths[corners], features.sigmas[corners])
+def observations(features: Features, corners: NDArray[np.int64], trust: Array | float = 1.0) -> Observations:
+    """What a frame measured at some of its corners; trust: [n] weight of each, as Map.trust gives it."""
+    return Observations(features.points[corners], features.depths[corners], features.sigmas[corners] / np.sqrt(trust))
 
 
 class Map:
@@ -61,6 +64,7 @@ class Map:
         self.born = np.zeros(1024, dtype=np.int64)  # keyframe index
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
         self.found = np.zeros(1024, dtype=np.int64)  # frames that did
+        self.moved = np.zeros(1024)  # log-odds against standing still, beyond those of a new point
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
@@ -108,6 +112,15 @@ class Map:
             fresh = ~taken[moved]
             self.observe(keyframe, Matches(moved[fresh], changed[first[fresh]]))
 
+    def trust(self, ids: NDArray[np.int64]) -> Array:
+        """[n] probability that each point stands still, as a share of a new point's: its weight, above 0 up to 1."""
+        return np.asarray((1 + np.exp(-_STILL)) / (1 + np.exp(self.moved[ids] - _STILL)))
+
+    def judge(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
+        """A frame has seen points stand still, and others move with a group that does not."""
+        self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)
+        self.moved[moving] = np.minimum(self.moved[moving] + _WENT, _CERTAIN)
+
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
 
@@ -154,6 +167,6 @@ class Map:
     def _reserve(self, count: int) -> None:
         names = ("positions", "descriptors", "directions", "reach", "seen_by", "observers", "born", "visible", "found")
         while len(self.positions) < count:
-            for name in names:
+            for name in (*names, "moved"):
                 array = getattr(self, name)
                 setattr(self, name, np.concatenate([array, np.zeros_like(array)]))

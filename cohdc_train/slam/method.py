@@ -9,12 +9,12 @@ class Method:
 
     Args:
         loops: a place seen before is recognised, checked and closed by a pose graph (paper 2.3, eqs. 10-12).
-        refinement: a new measurement's pixel is moved to where the point's patch fits best (paper eqs. 8 and 9).
-        geometry: what moves against the map is found by depth alone, whatever its class.
-        static_weights: a point that keeps contradicting its place in the map counts less, until it is dropped.
+        refinement: a keyframe's measurements move to where the points' patches fit best (paper eqs. 8 and 9).
+        geometry: what stands where a keyframe looked through moves, whatever its class; nothing is taken from there.
+        static_weights: groups of points that do not move with the rest are left out, and count less from then on.
     """
 
     loops: bool = True
-    refinement: bool = True
+    refinement: bool = False
     geometry: bool = True
     static_weights: bool = True

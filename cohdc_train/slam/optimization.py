@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cohdc_train.slam.camera import Camera
 
@@ -68,6 +69,17 @@ def exp_se3(xi: Array) -> Array:
     result[..., :3, 3] = ((np.eye(3) + b * cross + c * square) @ rho[..., None])[..., 0]
     result[..., 3, 3] = 1.0
     return result
+
+
+def log_se3(T: Array) -> Array:
+    """T: [..., 4, 4]. Returns [..., 6] (translation part, rotation vector rad), the inverse of exp_se3."""
+    phi = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
+    cross = skew(phi)
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    half = np.maximum(angle / 2, 1e-9)
+    c = np.where(angle < 1e-3, 1 / 12, (1 - half / np.tan(half)) / np.maximum(angle, 1e-9) ** 2)
+    left = np.eye(3) - 0.5 * cross + c * cross @ cross
+    return np.concatenate([(left @ T[..., :3, 3:])[..., 0], phi], axis=-1)
 
 
 def skew(v: Array) -> Array:

@@ -161,7 +161,8 @@ def _step(tracker: Tracker, view: View, mask_of: MaskSource) -> tuple[FrameRecor
     start = time.perf_counter()
     mask = mask_of(view)
     segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
-    pose = tracker.track(view.rgb, view.depth, view.t, mask)
+    pose = tracker.track(view.rgb, view.depth, view.t, mask, view.depth_t)
+    mask = tracker.mask
     return FrameRecord(view.stamp, pose, 0.0 if mask is None else float(mask.mean()), segment_ms), mask
 
 

@@ -17,7 +17,8 @@ class View:
     """One frame as the tracker takes it.
 
     t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending, which a mask in a
-    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading.
+    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading; depth_t: s, when
+    depth was taken, where that differs from t.
     """
 
     t: float
@@ -25,6 +26,7 @@ class View:
     name: str
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
+    depth_t: float | None = None
 
 
 class Source(Protocol):
@@ -64,4 +66,4 @@ class Recorded:
     def __iter__(self) -> Iterator[View]:
         for frame in self._sequence.frames:
             rgb, depth = read_rgb(frame.rgb, self.camera), read_depth(frame.depth, self.camera)
-            yield View(frame.t, frame.stamp, frame.rgb.stem, rgb, depth)
+            yield View(frame.t, frame.stamp, frame.rgb.stem, rgb, depth, frame.depth_t)

@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.culling import grow
 from cohdc_train.slam.features import FeatureExtractor, Features
+from cohdc_train.slam.geometry import Geometry, Reference
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, Weighing, optimize_pose
+from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, log_se3, optimize_pose
 from cohdc_train.slam.ransac import ransac_pose
+from cohdc_train.slam.refinement import Pyramid, Refiner
+from cohdc_train.slam.rigidity import pose_of_rest
 
 _MIN_START = 50  # points a first keyframe needs
 _MIN_FIRST = 15  # inliers of the first, rough pose
@@ -25,6 +29,9 @@ _MIN_FOUND_AGAIN = 40  # the same when the place was lost
 _LOCAL_KEYFRAMES = 15
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
 _KEYFRAME_FRAMES = 20
+_REFERENCES = 8  # keyframes whose depth a frame is held against
+_MOVER_BAND = 8.0  # px: as wide as a coarse pixel of that
+_LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
 _CANDIDATES = 6  # keyframes tried per lost frame
 
 
@@ -70,7 +77,10 @@ class Tracker:
         self.map = Map(camera)
         self.budget = features
         self.features: Features | None = None  # of the latest frame
+        self.mask: NDArray[np.bool_] | None = None  # what was left out of it: as given, and what geometry found
         self._extract = FeatureExtractor(camera, features)
+        self._geometry = Geometry(camera)
+        self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera)
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._rng = np.random.default_rng(seed)
@@ -82,17 +92,24 @@ class Tracker:
         self._log: list[tuple[float, Keyframe, Array]] = []  # stamp, reference keyframe, T of the frame in it
 
     def track(
-        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], t: float, mask: NDArray[np.bool_] | None = None
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        t: float,
+        mask: NDArray[np.bool_] | None = None,
+        depth_t: float | None = None,
     ) -> Pose:
         """Find the camera of the next frame.
 
         rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, 0 = no reading; t: s, rising;
         mask: [H, W] bool, True = dynamic: nothing is taken from there into the map. Where what is left does not carry
         a pose, the whole picture is matched against the map, whose points stand still; such a frame is no keyframe.
+        depth_t: s, when depth was taken, where that differs from t.
         """
         start = time.perf_counter()
         self._take_in_mapping()
-        features = self._extract(rgb, depth_m, mask)
+        mask = self.mask = self._with_movers(mask, depth_m)
+        features = self._extract(rgb, depth_m, mask, self._lag(t, depth_t))
         fit = self._locate(features, rgb)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
@@ -102,7 +119,7 @@ class Tracker:
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
         if fit is not None and keyframe:
-            fit = self._add_keyframe(features, fit, t, rgb)
+            fit = self._add_keyframe(features, fit, t, rgb, depth_m)
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
@@ -122,6 +139,29 @@ class Tracker:
         stamps = np.array([t for t, _, _ in self._log])
         poses = [np.linalg.inv(relative @ keyframe.T_cw) for _, keyframe, relative in self._log]
         return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
+
+    def _with_movers(self, mask: NDArray[np.bool_] | None, depth_m: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+        """The mask, and what depth says moves where the camera is expected."""
+        if not self.method.geometry or self._last is None:
+            return mask
+        around = self.map.covisible(self._last.matches.points, _LOCAL_KEYFRAMES)
+        around.sort(key=lambda keyframe: keyframe.index)
+        spread = np.unique(np.linspace(0, len(around) - 1, _REFERENCES).round().astype(int)).tolist()
+        references = [Reference(around[i].T_cw, around[i].nearest) for i in spread]
+        movers = self._geometry.movers(depth_m, self._velocity @ self._last.T_cw, references)
+        if not movers.any():
+            return mask
+        movers = grow(movers, _MOVER_BAND)
+        return movers if mask is None else mask | movers
+
+    def _lag(self, t: float, depth_t: float | None) -> Array | None:
+        """[4, 4] from the camera's frame at t to that at depth_t, by the velocity between the last two frames."""
+        if depth_t is None or self._last is None or len(self._log) < 2:
+            return None
+        step = self._log[-1][0] - self._log[-2][0]
+        if not 0 < step <= _LONGEST:
+            return None
+        return exp_se3(log_se3(self._velocity) * ((depth_t - t) / step))
 
     def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> _Fit | None:
         if not self.map.keyframes:
@@ -154,7 +194,7 @@ class Tracker:
     def _solve(self, features: Features, matches: Matches, guess: Array | None, hypotheses: int) -> _Fit | None:
         if len(matches) < _MIN_FIRST:
             return None
-        points, seen = self.map.positions[matches.points], observations(features, matches.corners)
+        points, seen = self._seen(features, matches)
         found = ransac_pose(points, seen, self.camera, self._rng, hypotheses, guess=guess)
         if found is None or found[1].sum() < _MIN_FIRST:
             return None
@@ -168,8 +208,12 @@ class Tracker:
         keyframes = self.map.covisible(rough.matches.points, _LOCAL_KEYFRAMES)
         projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
         matches = match_projected(projected, features, radius=5.0)
-        points, seen = self.map.positions[matches.points], observations(features, matches.corners)
-        T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
+        points, seen = self._seen(features, matches)
+        if self.method.static_weights:
+            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing)
+            self.map.judge(matches.points[inlier], matches.points[moving])
+        else:
+            T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
         if inlier.sum() < minimum:
             return None
         matches = matches.take(inlier)
@@ -178,6 +222,11 @@ class Tracker:
         best = self.map.covisible(matches.points, 1)
         self._reference = best[0]
         return _Fit(T_cw, matches)
+
+    def _seen(self, features: Features, matches: Matches) -> tuple[Array, Observations]:
+        """Where the map has the matched points, [m, 3] m, and what the frame measured of them."""
+        seen = observations(features, matches.corners, self.map.trust(matches.points))
+        return self.map.positions[matches.points], seen
 
     def _relocalise(self, features: Features, rgb: NDArray[np.uint8]) -> _Fit | None:
         """Try the keyframes that look most like the frame, and the newest."""
@@ -200,11 +249,19 @@ class Tracker:
             return True
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
-    def _add_keyframe(self, features: Features, fit: _Fit, t: float, rgb: NDArray[np.uint8]) -> _Fit:
+    def _add_keyframe(
+        self, features: Features, fit: _Fit, t: float, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
+    ) -> _Fit:
+        pyramid = Pyramid(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)) if self._refiner else None
+        if self._refiner is not None and pyramid is not None:
+            features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
-        keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, thumbnail(rgb))
+        pictures = thumbnail(rgb), self._geometry.nearest(depth_m)
+        keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, *pictures)
         insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
+        if self._refiner is not None and pyramid is not None:
+            self._refiner.remember(keyframe, pyramid)
         self._reference = keyframe
         self._since_keyframe = 0
         self._reference_inliers = 0

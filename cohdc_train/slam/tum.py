@@ -16,9 +16,10 @@ from cohdc_train.trajectory import associate
 
 @dataclass(frozen=True)
 class Frame:
-    """One associated pair; `t` is the colour image's stamp, s."""
+    """One associated pair; `t` is the colour image's stamp, s, `depth_t` the depth image's."""
 
     t: float
+    depth_t: float
     stamp: str
     rgb: Path
     depth: Path
@@ -59,7 +60,8 @@ def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
     if not pairs:
         raise DataError(f"{folder}: no image of rgb.txt lies within {max_difference:g} s of one of depth.txt")
     frames = tuple(
-        Frame(colours[i].t, colours[i].stamp, folder / colours[i].name, folder / depths[j].name) for i, j in pairs
+        Frame(c.t, d.t, c.stamp, folder / c.name, folder / d.name)
+        for c, d in ((colours[i], depths[j]) for i, j in pairs)
     )
     return Sequence(folder, frames, len(colours) - len(frames))
 

@@ -51,7 +51,7 @@ def open_window(world: Map, keyframe: Keyframe) -> Window:
     row = np.full(world.size + 1, -1)
     row[ids] = np.arange(len(ids))
     corners = [np.flatnonzero(row[k.point_ids] >= 0) for k in keyframes]
-    seen = [observations(k.features, c) for k, c in zip(keyframes, corners, strict=True)]
+    seen = [observations(k.features, c, world.trust(k.point_ids[c])) for k, c in zip(keyframes, corners, strict=True)]
     problem = Problem(
         cameras=np.repeat(np.arange(len(keyframes)), [len(c) for c in corners]),
         points=np.concatenate([row[k.point_ids[c]] for k, c in zip(keyframes, corners, strict=True)]),

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,11 @@ from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.async_masks import AsyncMasks
 from cohdc_train.slam.culling import Mask
-from cohdc_train.slam.map import Keyframe
 from cohdc_train.slam.optimization import exp_se3, to_local
 from cohdc_train.slam.paced import Paced
 from cohdc_train.slam.slot import Slot
 from cohdc_train.slam.source import View
-from cohdc_train.slam.tracking import Tracker, thumbnail
+from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.window import Solution, close_window, open_window
 from cohdc_train.trajectory import Trajectory, score
 
@@ -273,13 +273,12 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
     newest, features = world.keyframes[-1], tracker.features
     assert features is not None
     window = open_window(world, newest)
-    later = Keyframe(
-        len(world.keyframes),
-        2.0,
-        exp_se3(np.array([0.1, 0, 0, 0, 0.1, 0])) @ newest.T_cw,
-        features,
-        np.full(len(features), -1),
-        thumbnail(views[-1][0]),
+    later = replace(
+        newest,
+        index=len(world.keyframes),
+        T_cw=exp_se3(np.array([0.1, 0, 0, 0, 0.1, 0])) @ newest.T_cw,
+        features=features,
+        point_ids=np.full(len(features), -1),
     )
     world.add_keyframe(later)
     world.add_points(later, np.flatnonzero(features.depths > 0)[:20])

@@ -16,6 +16,7 @@ from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
 from cohdc_train.slam.culling import Culling, ModelMasks
+from cohdc_train.slam.method import Method
 from cohdc_train.slam.run import slam
 from cohdc_train.slam.source import View
 from cohdc_train.trajectory import read_tum
@@ -79,14 +80,14 @@ def test_pictures_show_what_was_culled(masked: Path) -> None:
     assert (before != after).any()
 
 
-def test_without_masks_the_passer_by_spoils_it_and_a_rerun_replaces_the_files(
+def test_without_masks_or_geometry_the_passer_by_spoils_it_and_a_rerun_replaces_the_files(
     sequence: Path, masked: Path, tmp_path: Path
 ) -> None:
     good = json.loads((masked / "metrics.json").read_text())["ate_m"]["rmse"]
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "old.jpg").touch()
     (tmp_path / "mine.txt").touch()
-    metrics = slam(sequence=sequence, out=tmp_path, features=500)
+    metrics = slam(sequence=sequence, out=tmp_path, features=500, method=Method(geometry=False, static_weights=False))
     assert metrics["ate_m"]["rmse"] > 5 * good
     assert metrics["ms"]["segment"]["p95"] == 0
     assert (tmp_path / "mine.txt").exists()

@@ -1,0 +1,167 @@
+"""Photometric refinement: a keyframe's measurement moves to where the point's patch fits best (paper eqs. 8 and 9).
+
+A corner of ORB lies on a whole pixel of its pyramid level. The patch that was cut out where the point was first seen,
+turned and scaled as the camera has moved since, says where in the image the point is to a fraction of that. We depart
+from eq. 9 in that A has four free entries: the patch is taken for a plane that faced the first camera.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.features import LEVELS, SCALE, Features
+from cohdc_train.slam.map import Keyframe, Map
+from cohdc_train.slam.matching import Matches
+from cohdc_train.slam.optimization import Array, to_local
+
+_STORED = 16  # px, side of a stored patch at its corner's level
+_SIDE = 8  # px, side of the part that is compared
+_STEPS = 6
+_FURTHEST = 1.5  # px at the corner's level: what fits better further off is something else
+_DONE = 0.02  # px
+_LIKENESS = 0.8  # least normalised correlation of patch and image
+_TEXTURE = 400.0  # least eigenvalue of the patch's gradients, squared grey values
+
+Floats = NDArray[np.float32]
+
+
+class Pyramid:
+    """A grey image at every level of the corners."""
+
+    def __init__(self, gray: NDArray[np.uint8]) -> None:
+        """gray: [H, W]."""
+        height, width = gray.shape
+        self.levels = [gray]
+        for level in range(1, LEVELS):
+            size = (round(width / SCALE**level), round(height / SCALE**level))
+            smaller = cv2.resize(self.levels[-1], size, interpolation=cv2.INTER_LINEAR_EXACT)
+            self.levels.append(np.asarray(smaller, dtype=np.uint8))
+
+    def cut(self, pixels: Array, octaves: NDArray[np.int64], offsets: Array) -> Floats:
+        """Grey values around pixels [n, 2] px of level 0. offsets: [n, k, 2] or [k, 2] px of each one's own level.
+
+        Returns [n, k]; beyond the border the border's.
+        """
+        offsets = np.broadcast_to(offsets, (len(pixels), *offsets.shape[-2:]))
+        result = np.empty(offsets.shape[:2], dtype=np.float32)
+        height, width = self.levels[0].shape
+        for level in np.unique(octaves).tolist():
+            rows = np.flatnonzero(octaves == level)
+            image = self.levels[level]
+            share = np.array([image.shape[1] / width, image.shape[0] / height])
+            places = (((pixels[rows] + 0.5) * share - 0.5)[:, None] + offsets[rows]).astype(np.float32)
+            x, y = places[..., 0], places[..., 1]
+            result[rows] = cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return result
+
+
+@dataclass
+class Refiner:
+    """Keeps the patch of every point of a map, and moves measurements by them."""
+
+    world: Map
+
+    def __post_init__(self) -> None:
+        self._patches = np.zeros((0, _STORED, _STORED), dtype=np.uint8)
+        self._octaves = np.zeros(0, dtype=np.int64)
+
+    def remember(self, keyframe: Keyframe, pyramid: Pyramid) -> None:
+        """Cut out the points that were born in a keyframe, which must be in the map."""
+        grown = self.world.size - len(self._patches)
+        self._patches = np.concatenate([self._patches, np.zeros((grown, _STORED, _STORED), dtype=np.uint8)])
+        self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
+        corners = np.flatnonzero(keyframe.point_ids >= 0)
+        corners = corners[self.world.born[keyframe.point_ids[corners]] == keyframe.index]
+        ids, octaves = keyframe.point_ids[corners], keyframe.features.octaves[corners]
+        patches = pyramid.cut(keyframe.features.pixels[corners], octaves, square(_STORED))
+        self._patches[ids] = np.rint(patches).reshape(-1, _STORED, _STORED)
+        self._octaves[ids] = octaves
+
+    def refine(self, features: Features, matches: Matches, T_cw: Array, pyramid: Pyramid) -> Features:
+        """The features with those matched corners moved that found a better place. T_cw: [4, 4] the frame's pose."""
+        if len(matches) == 0:
+            return features
+        ids, corners = matches.points, matches.corners
+        octaves = features.octaves[corners]
+        A = affine(self.world, ids, T_cw)
+        inverse = np.linalg.inv(A) * (SCALE ** (octaves - self._octaves[ids]))[:, None, None]
+        template = warped(self._patches[ids], inverse, _SIDE + 2)
+        shift, good = align(pyramid, features.pixels[corners], octaves, template)
+        rows = corners[good]
+        pixels, points = features.pixels.copy(), features.points.copy()
+        pixels[rows] += shift[good] * SCALE ** octaves[good, None]
+        points[rows] = self.world.camera.undistort(pixels[rows])
+        return replace(features, pixels=pixels, points=points)
+
+
+def square(side: int) -> Array:
+    """[side * side, 2] offsets (x, y) of a square's pixels from its middle, px, row by row."""
+    places = np.arange(side) - (side - 1) / 2
+    x, y = np.meshgrid(places, places)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
+    """A of eq. 9 for n points: [n, 2, 2] px of a camera at T_cw per px of the keyframe where each was first seen."""
+    camera, points = world.camera, world.positions[ids]
+    T_bw = np.stack([world.keyframes[index].T_cw for index in world.born[ids]])
+    depth = np.einsum("nj,nj->n", T_bw[:, 2, :3], points) + T_bw[:, 2, 3]  # in the keyframe of its birth
+    local = to_local(T_cw, points)
+    across = T_cw[:3, :3] @ T_bw[:, :2, :3].transpose(0, 2, 1)  # [n, 3, 2] that keyframe's x and y axes
+    across *= (depth[:, None] / np.array([camera.fx, camera.fy]))[:, None]  # m per px
+    A: Array = across[:, :2] - (local[:, :2] / local[:, 2:])[:, :, None] * across[:, 2:]
+    A *= np.array([camera.fx, camera.fy])[:, None] / local[:, 2, None, None]
+    return A
+
+
+def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
+    """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image, at their levels."""
+    places = np.einsum("nij,kj->nki", inverse, square(side)) + (_STORED - 1) / 2
+    places = np.clip(places, 0, _STORED - 1.001)
+    whole = np.floor(places).astype(np.int64)
+    x, y = whole[..., 0], whole[..., 1]
+    a, b = np.moveaxis((places - whole).astype(np.float32), -1, 0)
+    rows, grey = np.arange(len(patches))[:, None], patches.astype(np.float32)
+    upper = grey[rows, y, x] * (1 - a) + grey[rows, y, x + 1] * a
+    lower = grey[rows, y + 1, x] * (1 - a) + grey[rows, y + 1, x + 1] * a
+    return np.asarray(upper * (1 - b) + lower * b, dtype=np.float32).reshape(-1, side, side)
+
+
+def align(
+    pyramid: Pyramid, pixels: Array, octaves: NDArray[np.int64], template: Floats
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Minimise eq. 8 over each pixel by inverse composition; image and patch may differ in brightness and contrast.
+
+    pixels: [n, 2] px; template: [n, side + 2, side + 2], the patch with one px around it for its gradient. Returns
+    [n, 2] shifts, px of each one's level, and [n] bool: False where the patch has no texture, leaves its surroundings,
+    or does not look alike.
+    """
+    n = len(pixels)
+    inner = _centred(template[:, 1:-1, 1:-1])
+    contrast = np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-6)
+    dx = _centred(0.5 * (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]))
+    dy = _centred(0.5 * (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]))
+    gradient = np.stack([dx, dy], axis=1)  # [n, 2, k]
+    H = gradient @ gradient.transpose(0, 2, 1)
+    active = np.linalg.eigvalsh(H)[:, 0] > _TEXTURE
+    descent = np.linalg.inv(H + 1e-3 * np.eye(2)) @ gradient
+    shift, likeness, offsets = np.zeros((n, 2)), np.zeros(n), square(template.shape[1] - 2)
+    for _ in range(_STEPS):
+        rows = np.flatnonzero(active)
+        if len(rows) == 0:
+            break
+        seen = _centred(pyramid.cut(pixels[rows], octaves[rows], offsets + shift[rows, None]))
+        seen *= contrast[rows] / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-6)
+        likeness[rows] = (seen * inner[rows]).sum(axis=1) / contrast[rows, 0] ** 2
+        step = -np.einsum("nik,nk->ni", descent[rows], seen - inner[rows])
+        shift[rows] += step
+        active[rows] = np.abs(step).max(axis=1) > _DONE
+    return shift, (likeness >= _LIKENESS) & (np.linalg.norm(shift, axis=1) <= _FURTHEST)
+
+
+def _centred(patches: Floats) -> Floats:
+    """[n, k]: every patch without its mean."""
+    flat = patches.reshape(len(patches), -1)
+    return np.asarray(flat - flat.mean(axis=1, keepdims=True), dtype=np.float32)

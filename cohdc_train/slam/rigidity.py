@@ -1,0 +1,116 @@
+"""Groups of points that do not move with the rest, found before they drag the pose along.
+
+A near thing that begins to move slowly takes the pose with it: its few points fix the camera's position better than a
+far wall's many, which a small turn reconciles, so that no single residual stands out. Every group is therefore judged
+by a pose that was found without it. What lies further from there than that pose's own uncertainty and the noise of
+measurement allow, moves. The poses of all groups come from sums of the same normal equations.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import linkage
+from scipy.spatial.distance import cdist
+
+from cohdc_train.slam.optimization import (
+    Array,
+    Observations,
+    Weighing,
+    huber_weights,
+    optimize_pose,
+    pose_jacobian,
+    residual_jacobian,
+    residuals,
+    to_local,
+)
+
+_PATCHES = 24  # of neighbouring points: the leaves of the tree of groups
+_LEAST = 8  # points of a group that is judged
+_MOST = 0.6  # of all points: a larger group is the world
+_LIMIT = 9.0  # median squared distance, in standard deviations, from which a group moves
+_CLEARLY = 4.0  # times the limit: moving further counts no more than this
+_ROUNDS = 4  # groups taken out, one after the other
+
+
+def pose_of_rest(
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """The pose from the points that hold together, after those that move as groups were taken out.
+
+    T_cw: [4, 4] pose from all points; points: [m, 3] world, m. Returns the pose, [m] bool inliers and [m] bool members
+    of moving groups.
+    """
+    moving = np.zeros(len(points), dtype=np.bool_)
+    T_cw, inlier = optimize_pose(T_cw, points, seen, weighing)
+    for _ in range(_ROUNDS):
+        rest = np.flatnonzero(~moving)
+        group = moving_group(T_cw, points[rest], seen.take(rest), weighing)
+        if not group.any():
+            break
+        moving[rest[group]] = True
+        rest = np.flatnonzero(~moving)
+        T_cw, agrees = optimize_pose(T_cw, points[rest], seen.take(rest), weighing)
+        inlier = np.zeros(len(points), dtype=np.bool_)
+        inlier[rest[agrees]] = True
+    return T_cw, inlier, moving
+
+
+def moving_group(T_cw: Array, points: Array, seen: Observations, weighing: Weighing) -> NDArray[np.bool_]:
+    """The group that most clearly moves against the rest. T_cw: [4, 4] best pose of all; points: [m, 3] world, m.
+
+    Returns [m] bool, all False where everything holds together.
+    """
+    nothing = np.zeros(len(points), dtype=np.bool_)
+    if len(points) < 3 * _LEAST:
+        return nothing
+    local = to_local(T_cw, points)
+    groups = nested_groups(local)
+    error = residuals(local, seen, weighing)
+    J = pose_jacobian(local, residual_jacobian(local, seen, weighing))
+    steps, covariances = _poses_without(groups, J, error, seen.limits)
+    best, score = nothing, 0.0
+    for group, step, covariance in zip(groups, steps, covariances, strict=True):
+        by_pose = J[group]
+        off = error[group] + by_pose @ step
+        if np.median(np.einsum("mi,mi->m", off, off)) <= _LIMIT:  # the pose's uncertainty only makes less of it
+            continue
+        spread = np.eye(3) + by_pose @ covariance @ by_pose.transpose(0, 2, 1)
+        squares = np.einsum("mi,mi->m", off, np.linalg.solve(spread, off[..., None])[..., 0])
+        excess = float(np.median(squares)) / _LIMIT
+        if excess > 1 and len(off) * min(excess, _CLEARLY) > score:
+            best, score = group, len(off) * min(excess, _CLEARLY)
+    return best
+
+
+def _poses_without(groups: NDArray[np.bool_], J: Array, error: Array, limits: Array) -> tuple[Array, Array]:
+    """What each group's leaving would move the pose by, [g, 6], and the covariance of that pose, [g, 6, 6]."""
+    weight = huber_weights(np.einsum("mi,mi->m", error, error), limits)
+    weighted = J * weight[:, None, None]
+    H = (weighted.transpose(0, 2, 1) @ J).reshape(-1, 36)
+    g = np.einsum("mra,mr->ma", weighted, error)
+    share = groups.astype(np.float64)
+    covariances = np.linalg.inv((H.sum(axis=0) - share @ H).reshape(-1, 6, 6) + 1e-6 * np.eye(6))
+    return -np.einsum("gab,gb->ga", covariances, g.sum(axis=0) - share @ g), covariances
+
+
+def nested_groups(local: Array) -> NDArray[np.bool_]:
+    """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a judgeable size."""
+    patches, centres = _patches(local)
+    groups = list(patches)
+    if len(groups) > 1:
+        for first, second, _, _ in linkage(centres, "average"):
+            groups.append(groups[int(first)] | groups[int(second)])
+    members = np.stack(groups)
+    size = members.sum(axis=1)
+    return np.asarray(members[(size >= _LEAST) & (size <= _MOST * len(local))])
+
+
+def _patches(local: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Points by the nearest of a few that lie far apart: [p, m] bool, and the patches' middles [p, 3] m."""
+    chosen = [int(np.argmin(local[:, 2]))]
+    distance = np.full(len(local), np.inf)
+    for _ in range(min(_PATCHES, len(local)) - 1):
+        distance = np.minimum(distance, ((local - local[chosen[-1]]) ** 2).sum(axis=1))
+        chosen.append(int(np.argmax(distance)))
+    nearest = cdist(local, local[chosen]).argmin(axis=1)
+    patches = nearest[None] == np.unique(nearest)[:, None]
+    return patches, (patches @ local) / patches.sum(axis=1)[:, None]

@@ -1,0 +1,162 @@
+"""What moves without a mask: by depth, by groups of points, and what the tracker makes of both."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from plane_world import CAMERA, camera_path, passer_by, render, room
+
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.map import Map
+from cohdc_train.slam.method import Method
+from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, log_se3, optimize_pose
+from cohdc_train.slam.rigidity import moving_group, pose_of_rest
+from cohdc_train.slam.tracking import Tracker
+from cohdc_train.trajectory import Trajectory, score
+
+WEIGHING = Weighing(CAMERA)
+LENS = replace(CAMERA, k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)
+STILL = np.eye(4)
+Depth = NDArray[np.float32]
+
+
+def wall(depth: float = 3.0) -> Depth:
+    return np.full((240, 320), depth, dtype=np.float32)
+
+
+def with_box(image: Depth, left: int, depth: float) -> Depth:
+    """A box of 80 x 80 px before it."""
+    image = image.copy()
+    image[80:160, left : left + 80] = depth
+    return image
+
+
+def found(camera: Camera, now: Depth, before: list[Depth], T_cw: Array = STILL) -> NDArray[np.bool_]:
+    geometry = Geometry(camera)
+    return geometry.movers(now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before])
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_what_stands_where_keyframes_looked_through_moves(camera: Camera) -> None:
+    now = with_box(wall(), 120, 1.5)
+    mask = found(camera, now, [wall(), wall(), wall()])
+    box = now < 2
+    assert (mask & box).sum() > 0.95 * box.sum()
+    assert (mask & ~box).sum() < 0.15 * box.sum()
+
+
+@pytest.mark.parametrize(
+    ("now", "before"),
+    [
+        (with_box(wall(), 120, 1.5), [with_box(wall(), 120, 1.5)] * 3),
+        (wall(), [with_box(wall(), 120, 1.5)] * 3),
+        (with_box(wall(), 120, 2.9), [wall()] * 3),
+        (with_box(wall(), 120, 1.5), [wall(), *[with_box(wall(), 120, 1.5)] * 2]),
+        (with_box(wall(), 120, 1.5), [wall(0.0)] * 3),
+        (wall(1.5), [wall()] * 3),
+    ],
+    ids=["stands still", "went away", "within noise", "one vote", "nothing known", "all of it: the pose is wrong"],
+)
+def test_what_says_nothing_of_movement_is_left_alone(now: Depth, before: list[Depth]) -> None:
+    assert not found(CAMERA, now, before).any()
+
+
+def test_the_camera_may_move() -> None:
+    """Two views of the still room 20 cm apart: nothing moves; with a wrong pose something would seem to."""
+    path = camera_path(40)
+    first, second = (render(room(), path[k])[1] for k in (0, 15))
+    geometry = Geometry(CAMERA)
+    references = [Reference(np.linalg.inv(path[0]), geometry.nearest(first))] * 2
+    assert not geometry.movers(second, np.linalg.inv(path[15]), references).any()
+
+
+@given(st.floats(0, 319), st.floats(0, 239))
+def test_the_lens_bends_back(x: float, y: float) -> None:
+    pixel = np.array([[x, y]])
+    np.testing.assert_allclose(LENS.distort(LENS.undistort(pixel)), pixel, atol=1e-3)
+
+
+def scene(seed: int, shift: float) -> tuple[Array, Observations, NDArray[np.bool_]]:
+    """300 points of shelves 3 to 4 m away and 40 of a cart at 1 m that has rolled by `shift` m since it was mapped."""
+    rng = np.random.default_rng(seed)
+    far = rng.uniform([-1.8, -1.3, 3.0], [1.8, 1.3, 4.0], (300, 3))
+    near = rng.uniform([-0.4, 0.0, 0.9], [0.0, 0.35, 1.1], (40, 3))
+    points, cart = np.concatenate([far, near]), np.arange(340) >= 300
+    local = points + cart[:, None] * np.array([shift, 0, 0])
+    pixels = CAMERA.project(local) + rng.normal(0, 0.5, (340, 2))
+    depths = local[:, 2] + rng.normal(0, 0.003, 340) * local[:, 2] ** 2
+    return points, Observations(pixels, depths, np.ones(340)), cart
+
+
+@given(st.integers(0, 10_000), st.floats(0.03, 0.06))
+def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shift: float) -> None:
+    points, seen, cart = scene(seed, shift)
+    dragged, inlier = optimize_pose(STILL, points, seen, WEIGHING)
+    assert np.linalg.norm(dragged[:3, 3]) > shift, "the cart takes the pose along, and further than it went"
+    assert inlier[~cart].mean() > 0.8, "and no residual shows it"
+    pose, inlier, moving = pose_of_rest(STILL, points, seen, WEIGHING)
+    assert moving[cart].mean() > 0.9
+    assert moving[~cart].mean() < 0.02
+    assert not (inlier & moving).any()
+    assert np.linalg.norm(pose[:3, 3]) < 0.015
+
+
+@given(st.integers(0, 10_000))
+def test_a_world_that_stands_still_has_no_group_that_moves(seed: int) -> None:
+    points, seen, _ = scene(seed, 0.0)
+    pose, _ = optimize_pose(STILL, points, seen, WEIGHING)
+    assert not moving_group(pose, points, seen, WEIGHING).any()
+
+
+def test_few_points_are_not_judged() -> None:
+    points, seen, _ = scene(0, 0.02)
+    assert not moving_group(STILL, points[-20:], seen.take(np.arange(320, 340)), WEIGHING).any()
+
+
+def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() -> None:
+    world, ids = Map(CAMERA), np.array([0, 1])
+    np.testing.assert_array_equal(world.trust(ids), 1)
+    weights = []
+    for _ in range(5):
+        world.judge(still=ids[1:], moving=ids[:1])
+        weights.append(world.trust(ids)[0])
+    assert weights == sorted(weights, reverse=True)
+    assert weights[-1] < 0.02
+    assert world.trust(ids)[1] == 1
+    for _ in range(100):
+        world.judge(still=ids, moving=ids[:0])
+    np.testing.assert_array_equal(world.trust(ids), 1)
+
+
+@given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
+def test_log_undoes_exp(xi: list[float]) -> None:
+    np.testing.assert_allclose(log_se3(exp_se3(np.array(xi))), xi, atol=1e-7)
+
+
+def test_depth_that_comes_late_is_carried_back() -> None:
+    """The camera nears the wall by 3 cm before depth is taken, and turns."""
+    lag = np.linalg.inv(exp_se3(np.array([0.01, 0.0, 0.03, 0.0, 0.02, 0.0])))
+    rgb, depth, _ = render(room()[:1], STILL)
+    late = render(room()[:1], np.linalg.inv(lag))[1]
+    extract = FeatureExtractor(CAMERA, 300)
+    truth, told, untold = (extract(rgb, *rest).depths for rest in ((depth,), (late, None, lag), (late,)))
+    assert np.nanmax(np.abs(told - truth)) < 0.002
+    assert np.nanmedian(np.abs(untold - truth)) > 0.02
+
+
+def test_a_passer_by_spoils_less_without_any_mask() -> None:
+    frames, stamps = 30, np.arange(30) / 30
+    path = camera_path(frames)
+    views = [render([*room(), passer_by(k)], path[k])[:2] for k in range(frames)]
+    errors = []
+    for method in (Method(geometry=False, static_weights=False), Method()):
+        tracker = Tracker(CAMERA, features=500, method=method)
+        for t, (rgb, depth) in zip(stamps, views, strict=True):
+            tracker.track(rgb, depth, float(t))
+        errors.append(score(Trajectory(stamps, path), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"])
+    assert errors[1] < 0.2 * errors[0]
