@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.optimization import to_local
+from cohdc_train.slam.optimization import inverse, to_local
 
 SCALE = 1.2  # between two levels of the image pyramid
 LEVELS = 8
@@ -103,7 +103,7 @@ class FeatureExtractor:
         there = self.camera.project(to_local(lag, self.camera.backproject(points, depths)))
         shift = np.nan_to_num(there - points)
         moved = sample_depth(depth, pixels + shift, mask)
-        return to_local(np.linalg.inv(lag).astype(np.float64), self.camera.backproject(points + shift, moved))[:, 2]
+        return to_local(inverse(lag), self.camera.backproject(points + shift, moved))[:, 2]
 
     def _detect(self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None) -> Sequence[cv2.KeyPoint]:
         """Strong corners, which are quick to find; where they do not suffice, weak ones too."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.optimization import Array, to_local
+from cohdc_train.slam.optimization import Array, inverse, to_local
 
 _STEP = 8  # px of the image per coarse pixel
 _CENTRE = (_STEP - 1) / 2
@@ -77,7 +77,7 @@ class Geometry:
         """How many references looked through each coarse pixel's place, and how many saw a surface there: [h, w]."""
         h, w = self._shape
         rows = np.flatnonzero(image)
-        world = to_local(np.linalg.inv(T_cw).astype(np.float64), self._rays[rows] * image.ravel()[rows, None])
+        world = to_local(inverse(T_cw), self._rays[rows] * image.ravel()[rows, None])
         through, agrees = (np.zeros(h * w, dtype=np.int64) for _ in range(2))
         for reference in references:
             local = to_local(reference.T_cw, world)

@@ -121,6 +121,12 @@ class Map:
         self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)
         self.moved[moving] = np.minimum(self.moved[moving] + _WENT, _CERTAIN)
 
+    def shared(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[keyframes] how many of the points each keyframe sees."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        flags[ids] = True
+        return np.array([np.count_nonzero(flags[k.point_ids]) for k in self.keyframes])
+
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
 
@@ -135,6 +141,13 @@ class Map:
         shared = np.array([np.count_nonzero(flags[self.keyframes[i].point_ids]) for i in near], dtype=np.int64)
         order = np.argsort(-shared, kind="stable")[:limit]
         return [self.keyframes[near[i]] for i in order if shared[i] > 0]
+
+    def move_points(self, motions: Array) -> None:
+        """Every point goes along with the keyframe it was born in. motions: [keyframes, 4, 4] of the world, m."""
+        motion = motions[self.born[: self.size]]
+        moved = np.einsum("nij,nj->ni", motion[:, :3, :3], self.positions[: self.size])
+        self.positions[: self.size] = moved + motion[:, :3, 3]
+        self.directions[: self.size] = np.einsum("nij,nj->ni", motion[:, :3, :3], self.directions[: self.size])
 
     def points_of(self, keyframes: list[Keyframe]) -> NDArray[np.int64]:
         """Ids of the points that any of the keyframes sees, rising."""

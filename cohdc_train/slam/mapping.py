@@ -41,13 +41,18 @@ def fuse(world: Map, keyframe: Keyframe) -> None:
     """Look for the keyframe's points in its neighbours: more measurements; duplicates become the older point."""
     neighbours = [k for k in world.covisible(keyframe.seen_points(), _FUSE_KEYFRAMES + 1) if k is not keyframe]
     for other in neighbours:
-        ids = np.setdiff1d(keyframe.seen_points(), other.seen_points())
-        matches = match_projected(world.project(ids, other.T_cw), other.features, radius=3.0, max_distance=60)
-        current = other.point_ids[matches.corners]
-        world.observe(other, matches.take(current < 0))
-        known = matches.take(current >= 0)
-        if len(known):
-            _merge(world, known.points, other.point_ids[known.corners], [keyframe, *neighbours])
+        fuse_into(world, keyframe.seen_points(), other, [keyframe, *neighbours])
+
+
+def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]) -> None:
+    """Look for points in one keyframe that may not know them yet; `keyframes` are all that may hold duplicates."""
+    ids = np.setdiff1d(ids, other.seen_points())
+    matches = match_projected(world.project(ids, other.T_cw), other.features, radius=3.0, max_distance=60)
+    current = other.point_ids[matches.corners]
+    world.observe(other, matches.take(current < 0))
+    known = matches.take(current >= 0)
+    if len(known):
+        _merge(world, known.points, other.point_ids[known.corners], keyframes)
 
 
 def _merge(world: Map, first: NDArray[np.int64], second: NDArray[np.int64], keyframes: list[Keyframe]) -> None:

@@ -82,6 +82,15 @@ def log_se3(T: Array) -> Array:
     return np.concatenate([(left @ T[..., :3, 3:])[..., 0], phi], axis=-1)
 
 
+def inverse(T: Array) -> Array:
+    """T: [..., 4, 4] rigid. Returns [..., 4, 4]."""
+    result = np.zeros_like(T)
+    result[..., :3, :3] = T[..., :3, :3].swapaxes(-1, -2)
+    result[..., :3, 3:] = -result[..., :3, :3] @ T[..., :3, 3:]
+    result[..., 3, 3] = 1.0
+    return result
+
+
 def skew(v: Array) -> Array:
     """v: [..., 3]. Returns [..., 3, 3] with skew(v) @ w = v x w."""
     result = np.zeros((*v.shape, 3))

@@ -89,13 +89,13 @@ def slam(
         views, mask_of = (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
         records = _run(tracker, views, mask_of, part)
         trajectory = Trajectory(*tracker.trajectory())
-        metrics = {"seed": seed, "realtime": realtime, "without_depth": source.without_depth}
+        metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops}
+        metrics["without_depth"] = source.without_depth
         metrics |= measure(records, trajectory, source.groundtruth, beside.source.dropped if beside else 0)
         metrics |= beside.metrics() if beside else {}
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
-    print(summary(metrics))
-    print(f"written to {out}")
+    print(f"{summary(metrics)}\nwritten to {out}")
     return metrics
 
 
@@ -104,6 +104,7 @@ def summary(metrics: dict[str, Any]) -> str:
     rows = [
         ("frames", f"{metrics['tracked']} of {metrics['frames']} tracked ({100 * metrics['coverage']:.1f} %)"),
         ("keyframes", str(metrics["keyframes"])),
+        ("loops closed", str(metrics["loops"])),
         ("frames/s", f"{metrics['fps']:.1f}"),
     ]
     times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}

@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.culling import grow
 from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.loop_closing import LoopCloser
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
@@ -84,6 +86,7 @@ class Tracker:
         self._weighing = Weighing(camera)
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._rng = np.random.default_rng(seed)
+        self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._velocity = np.eye(4)
         self._last: _Fit | None = None
         self._reference: Keyframe | None = None
@@ -120,6 +123,8 @@ class Tracker:
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
         if fit is not None and keyframe:
             fit = self._add_keyframe(features, fit, t, rgb, depth_m)
+            if self._loops is not None:
+                fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
@@ -130,6 +135,11 @@ class Tracker:
         """Wait for mapping that runs beside tracking; the trajectory is better for it."""
         if self._mapper is not None:
             self._mapper.finish(self.map)
+
+    @property
+    def loops(self) -> int:
+        """How many loops were closed."""
+        return 0 if self._loops is None else self._loops.closed
 
     def trajectory(self) -> tuple[Array, Array]:
         """All tracked frames, each re-derived from its reference keyframe as the map has it now.
@@ -265,8 +275,17 @@ class Tracker:
         self._reference = keyframe
         self._since_keyframe = 0
         self._reference_inliers = 0
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
-        return _Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners))
+        return _fit_of(keyframe)
+
+    def _close_loop(self, fit: _Fit, loops: LoopCloser, picture: Picture) -> _Fit:
+        """The newest keyframe's fit; after a loop the last frame's pose goes along, so that the velocity stays."""
+        keyframe = self.map.keyframes[-1]
+        if not loops.close(keyframe, picture):
+            return fit
+        if self._last is not None:
+            moved = self._last.T_cw @ np.linalg.inv(fit.T_cw) @ keyframe.T_cw
+            self._last = _Fit(moved, self._last.matches)
+        return _fit_of(keyframe)
 
     def _remember(self, fit: _Fit | None, t: float) -> None:
         if fit is None or self._reference is None:
@@ -279,6 +298,11 @@ class Tracker:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
         self._log.append((t, self._reference, fit.T_cw @ np.linalg.inv(self._reference.T_cw)))
+
+
+def _fit_of(keyframe: Keyframe) -> _Fit:
+    corners = np.flatnonzero(keyframe.point_ids >= 0)
+    return _Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners))
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

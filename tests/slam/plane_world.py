@@ -83,6 +83,8 @@ def render(
     for item in rectangles:
         origin = T_cw[:3, :3] @ item.origin + T_cw[:3, 3]
         across, down = T_cw[:3, :3] @ item.across, T_cw[:3, :3] @ item.down
+        if max(corner[2] for corner in (origin, origin + across, origin + down, origin + across + down)) <= 0.1:
+            continue
         normal = np.cross(across, down)
         depth = (normal @ origin) / (rays @ normal)
         local = rays * depth[..., None] - origin

@@ -14,7 +14,7 @@ from cohdc_train.slam.features import FeatureExtractor
 from cohdc_train.slam.geometry import Geometry, Reference
 from cohdc_train.slam.map import Map
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, log_se3, optimize_pose
+from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, optimize_pose
 from cohdc_train.slam.rigidity import moving_group, pose_of_rest
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.trajectory import Trajectory, score
@@ -131,11 +131,6 @@ def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() 
     for _ in range(100):
         world.judge(still=ids, moving=ids[:0])
     np.testing.assert_array_equal(world.trust(ids), 1)
-
-
-@given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
-def test_log_undoes_exp(xi: list[float]) -> None:
-    np.testing.assert_allclose(log_se3(exp_se3(np.array(xi))), xi, atol=1e-7)
 
 
 def test_depth_that_comes_late_is_carried_back() -> None:

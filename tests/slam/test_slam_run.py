@@ -46,6 +46,7 @@ def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
     assert metrics["coverage"] == 1.0
     assert metrics["seed"] == 1
     assert metrics["without_depth"] == 0
+    assert metrics["loops"] == 0
     assert set(metrics["ms"]) == {"segment", "track", "map"}
     assert 0 < metrics["ms"]["track"]["p50"] <= metrics["ms"]["track"]["p95"]
     for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):

@@ -1,0 +1,119 @@
+"""A camera that walks round a hall and comes back, with loops and without."""
+
+import numpy as np
+import pytest
+from loop_world import View, poor_view, way_round
+from plane_world import CAMERA
+
+from cohdc_train.slam.alignment import Picture, take_picture
+from cohdc_train.slam.map import Keyframe
+from cohdc_train.slam.method import Method
+from cohdc_train.slam.optimization import Weighing, exp_se3, inverse
+from cohdc_train.slam.tracking import Pose, Tracker
+from cohdc_train.slam.verification import Loop, Verifier
+from cohdc_train.trajectory import Trajectory, score
+
+FRAMES = 180
+TRUTH = way_round(FRAMES)
+Run = tuple[Tracker, list[Pose]]
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    rng = np.random.default_rng(1)
+    return [poor_view(pose, rng) for pose in TRUTH]
+
+
+def run(views: list[View], loops: bool) -> Run:
+    tracker = Tracker(CAMERA, features=250, method=Method(loops=loops))
+    return tracker, [tracker.track(rgb, depth, index / 30) for index, (rgb, depth) in enumerate(views)]
+
+
+@pytest.fixture(scope="module")
+def closed(views: list[View]) -> Run:
+    return run(views, loops=True)
+
+
+@pytest.fixture(scope="module")
+def drifting(views: list[View]) -> Run:
+    return run(views, loops=False)
+
+
+def ate(tracker: Tracker) -> float:
+    """RMSE, m."""
+    return score(Trajectory(np.arange(FRAMES) / 30, TRUTH), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"]
+
+
+def test_closing_the_loop_takes_out_the_drift(drifting: Run, closed: Run) -> None:
+    assert all(pose.tracked for pose in closed[1])
+    assert (closed[0].loops, drifting[0].loops) == (1, 0)
+    assert ate(drifting[0]) > 0.03
+    assert ate(closed[0]) < 0.5 * ate(drifting[0])
+
+
+def test_the_camera_lands_on_the_closed_map_at_once(drifting: Run, closed: Run) -> None:
+    ends = [poses[-1].T_wc @ inverse(inverse(TRUTH[0]) @ TRUTH[-1]) for _, poses in (drifting, closed)]
+    off = [float(np.linalg.norm(end[:3, 3])) for end in ends]
+    assert off[1] < 0.3 * off[0]
+    assert min(pose.inliers for pose in closed[1][-8:]) > 60
+
+
+def test_both_ends_of_a_loop_share_points(closed: Run) -> None:
+    world = closed[0].map
+    assert world.shared(world.keyframes[-1].seen_points())[:6].max() > 30
+    seen = [keyframe.seen_points() for keyframe in world.keyframes]
+    assert all(len(ids) == len(np.unique(ids)) for ids in seen), "a keyframe sees a point once"
+    counts = np.bincount(np.concatenate(seen), minlength=world.size)
+    np.testing.assert_array_equal(world.seen_by[: world.size], counts)
+
+
+def test_same_views_same_bits(views: list[View], closed: Run) -> None:
+    again, _ = run(views, loops=True)
+    assert again.trajectory()[1].tobytes() == closed[0].trajectory()[1].tobytes()
+
+
+class TestVerification:
+    """The newest keyframe of the drifting run, which has come back to where the first ones were taken."""
+
+    @pytest.fixture
+    def pictures(self, views: list[View], drifting: Run) -> list[Picture]:
+        chosen = [views[round(30 * keyframe.t)] for keyframe in drifting[0].map.keyframes]
+        return [take_picture(rgb, depth, None, CAMERA) for rgb, depth in chosen]
+
+    def verify(self, tracker: Tracker, pictures: list[Picture]) -> Loop | None:
+        newest = tracker.map.keyframes[-1]
+        there = np.linalg.norm(TRUTH[:, :3, 3] - TRUTH[frame(newest), :3, 3], axis=1)
+        old = min(tracker.map.keyframes[:20], key=lambda k: float(there[frame(k)]))
+        return Verifier(tracker.map, Weighing(CAMERA), np.random.default_rng(0))(newest, old, pictures)
+
+    def test_gives_the_true_motion_not_the_drifted_one(self, drifting: Run, pictures: list[Picture]) -> None:
+        tracker = drifting[0]
+        loop = self.verify(tracker, pictures)
+        assert loop is not None
+        assert loop.new[0] == len(pictures) - 1
+        assert len(loop.new) >= 3
+        for index, T in zip(loop.new, loop.T, strict=True):
+            old, new = tracker.map.keyframes[loop.old], tracker.map.keyframes[index]
+            truth = inverse(TRUTH[frame(new)]) @ TRUTH[frame(old)]
+            off = np.linalg.norm((T @ inverse(truth))[:3, 3])
+            assert off < 0.02
+            assert off < 0.3 * np.linalg.norm((new.T_cw @ inverse(old.T_cw) @ inverse(truth))[:3, 3])
+
+    def test_neighbours_that_contradict_refuse_it(self, drifting: Run, pictures: list[Picture]) -> None:
+        keyframes = drifting[0].map.keyframes[-6:-1]
+        before = [keyframe.T_cw for keyframe in keyframes]
+        for keyframe in keyframes:
+            keyframe.T_cw = exp_se3(np.array([0.1, 0, 0, 0, 0, 0])) @ keyframe.T_cw
+        try:
+            assert self.verify(drifting[0], pictures) is None
+        finally:
+            for keyframe, T_cw in zip(keyframes, before, strict=True):
+                keyframe.T_cw = T_cw
+
+    def test_pictures_that_contradict_refuse_it(self, drifting: Run, pictures: list[Picture]) -> None:
+        assert self.verify(drifting[0], [*pictures[:-1], pictures[len(pictures) // 2]]) is None
+
+
+def frame(keyframe: Keyframe) -> int:
+    """The number of the view that a keyframe is."""
+    return round(30 * keyframe.t)
