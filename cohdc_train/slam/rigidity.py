@@ -24,9 +24,9 @@ from cohdc_train.slam.optimization import (
 )
 
 _PATCHES = 24  # of neighbouring points: the leaves of the tree of groups
-_LEAST = 8  # points of a group that is judged
+_LEAST = 12  # points of a group that is judged
 _MOST = 0.6  # of all points: a larger group is the world
-_LIMIT = 9.0  # median squared distance, in standard deviations, from which a group moves
+_LIMIT = 16.0  # median squared distance, in standard deviations, from which a group moves
 _CLEARLY = 4.0  # times the limit: moving further counts no more than this
 _ROUNDS = 4  # groups taken out, one after the other
 
