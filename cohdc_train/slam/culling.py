@@ -68,13 +68,22 @@ def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Cullin
     corners.
     Returns [H, W] bool, True = dynamic.
     """
-    sure = (detections.scores >= culling.score) & (detections.quality >= culling.quality)
-    keep = sure & np.isin(detections.labels, list(labels))
-    chosen = detections.select(keep)
+    chosen = dynamic_objects(detections, labels, culling)
     union = np.zeros(detections.size, dtype=np.bool_)
     for mask, quality in zip(chosen.masks(), chosen.quality, strict=True):
-        union |= grow(mask, culling.dilate * (2.0 - float(np.clip(quality, 0.0, 1.0))))
+        union |= grow(mask, growth(culling, float(quality)))
     return union
+
+
+def dynamic_objects(detections: Detections, labels: frozenset[int], culling: Culling) -> Detections:
+    """Those of the dynamic classes that are sure enough."""
+    sure = (detections.scores >= culling.score) & (detections.quality >= culling.quality)
+    return detections.select(sure & np.isin(detections.labels, list(labels)))
+
+
+def growth(culling: Culling, quality: float) -> float:
+    """By how many px a contour of a CQE quality grows."""
+    return culling.dilate * (2.0 - min(max(quality, 0.0), 1.0))
 
 
 def no_masks(view: View) -> Mask | None:
@@ -92,8 +101,11 @@ class FolderMasks:
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool. Raises DataError when the frame's mask is missing: a missed person would spoil the map."""
-        mask = read_mask(self._folder / f"{view.name}.png", self._camera)
-        return grow(mask, self._culling.dilate)
+        return grow(*self.outline(view))
+
+    def outline(self, view: View) -> tuple[Mask, float]:
+        """The mask as the file has it, and by how many px it is to grow."""
+        return read_mask(self._folder / f"{view.name}.png", self._camera), self._culling.dilate
 
 
 class ModelMasks:
@@ -111,3 +123,9 @@ class ModelMasks:
     def __call__(self, view: View) -> Mask:
         """[H, W] bool."""
         return dynamic_mask(self._segmenter(view.rgb), self._labels, self._culling)
+
+    def outline(self, view: View) -> tuple[Mask, float]:
+        """The mask before it grows, and by how many px it is to: as much as its contours should on average."""
+        chosen = dynamic_objects(self._segmenter(view.rgb), self._labels, self._culling)
+        quality = float(chosen.quality.mean()) if len(chosen) else 1.0
+        return np.asarray(chosen.masks().any(axis=0)), growth(self._culling, quality)

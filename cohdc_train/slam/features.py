@@ -165,10 +165,10 @@ def sample_depth(
     x, y = np.rint(pixels).astype(np.int64).T
     columns = np.clip(x[:, None, None] + offsets[None, None, :], 0, width - 1)
     rows = np.clip(y[:, None, None] + offsets[None, :, None], 0, height - 1)
-    patch = depth[rows, columns].reshape(len(pixels), -1).astype(np.float64)
-    centre = patch[:, patch.shape[1] // 2]
-    far = patch.max(axis=1)
-    near = np.where(patch > 0, patch, np.inf).min(axis=1)
+    patch = depth[rows, columns].reshape(len(pixels), -1)
+    centre = patch[:, patch.shape[1] // 2].astype(np.float64)
+    far = patch.max(axis=1).astype(np.float64)
+    near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=1).astype(np.float64)
     refused = (centre <= 0) | (far - near > _EDGE_RELATIVE * centre)
     if mask is not None:
         reach = np.ones((2 * _MASK_BAND + 1, 2 * _MASK_BAND + 1), dtype=np.uint8)

@@ -11,6 +11,8 @@ from cohdc_train.slam.matching import Matches, Projected
 from cohdc_train.slam.optimization import Array, Observations, to_local
 
 _NEAR = 0.1  # m
+_OBSERVERS = 8  # a point remembers by which keyframes it was seen last
+_NEIGHBOURS = 64  # keyframes that are looked at when those that share most points are sought
 _STILL = 3.0  # log-odds that a new point stands still
 _WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
 _VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
@@ -58,6 +60,7 @@ class Map:
         self.directions = np.zeros((1024, 3))  # sum of unit vectors from camera centres to the point
         self.reach = np.zeros(1024)  # m: from further away not even the finest level shows the point
         self.seen_by = np.zeros(1024, dtype=np.int64)  # keyframes
+        self.observers = np.zeros((1024, _OBSERVERS), dtype=np.int32)  # keyframe index + 1, 0 = none, in any order
         self.born = np.zeros(1024, dtype=np.int64)  # keyframe index
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
         self.found = np.zeros(1024, dtype=np.int64)  # frames that did
@@ -66,9 +69,7 @@ class Map:
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
         self.keyframes.append(keyframe)
-        ids = keyframe.seen_points()
-        self.seen_by[ids] += 1
-        self._add_directions(ids, keyframe)
+        self._add_observer(keyframe.seen_points(), keyframe)
 
     def add_points(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
         """New points at the depth that was measured at corners of a keyframe."""
@@ -87,8 +88,7 @@ class Map:
     def observe(self, keyframe: Keyframe, matches: Matches) -> None:
         """Corners of a keyframe, free so far, are measurements of points."""
         keyframe.point_ids[matches.corners] = matches.points
-        self.seen_by[matches.points] += 1
-        self._add_directions(matches.points, keyframe)
+        self._add_observer(matches.points, keyframe)
 
     def forget(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
         """Corners of a keyframe are no measurements of their points."""
@@ -128,10 +128,19 @@ class Map:
         return np.array([np.count_nonzero(flags[k.point_ids]) for k in self.keyframes])
 
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
-        """Keyframes that see at least one of the points, those that see most first."""
-        shared = self.shared(ids)
+        """Keyframes that see at least one of the points, those that see most first.
+
+        Only the 64 that occur most often among the points' latest observers are looked at, so that the time this takes
+        does not grow with the map.
+        """
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        flags[ids] = True
+        often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
+        near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBOURS])
+        near = near[often[near] > 0]
+        shared = np.array([np.count_nonzero(flags[self.keyframes[i].point_ids]) for i in near], dtype=np.int64)
         order = np.argsort(-shared, kind="stable")[:limit]
-        return [self.keyframes[i] for i in order if shared[i] > 0]
+        return [self.keyframes[near[i]] for i in order if shared[i] > 0]
 
     def move_points(self, motions: Array) -> None:
         """Every point goes along with the keyframe it was born in. motions: [keyframes, 4, 4] of the world, m."""
@@ -162,13 +171,15 @@ class Map:
         levels = np.clip(np.rint(level[inside]), 0, LEVELS - 1).astype(np.int64)
         return Projected(ids[inside], pixels[inside], levels, self.descriptors[ids[inside]])
 
-    def _add_directions(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
+    def _add_observer(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
+        self.observers[ids, self.seen_by[ids] % _OBSERVERS] = keyframe.index + 1
+        self.seen_by[ids] += 1
         offset = self.positions[ids] - keyframe.centre()
         self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
 
     def _reserve(self, count: int) -> None:
-        names = ("positions", "descriptors", "directions", "reach", "seen_by", "born", "visible", "found", "moved")
+        names = ("positions", "descriptors", "directions", "reach", "seen_by", "observers", "born", "visible", "found")
         while len(self.positions) < count:
-            for name in names:
+            for name in (*names, "moved"):
                 array = getattr(self, name)
                 setattr(self, name, np.concatenate([array, np.zeros_like(array)]))

@@ -3,27 +3,29 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.bundle_adjustment import Problem, adjust, measurement_chi2
-from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.background_mapping import BackgroundMapper
+from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import match_projected
-from cohdc_train.slam.optimization import Observations, Weighing
+from cohdc_train.slam.optimization import Weighing
+from cohdc_train.slam.window import WINDOW, close_window, open_window, solve
 
-WINDOW = 12  # keyframes in local bundle adjustment
-FIXED = 3  # of them hold still and carry the frame of reference
 _FUSE_KEYFRAMES = 8
 _TRIAL = 3  # keyframes after which a point must have proved itself
 _MIN_SEEN_BY = 3
 _MIN_FOUND = 0.25
 
 
-def insert_keyframe(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
-    """Take a tracked keyframe into the map and put its neighbourhood in order."""
+def insert_keyframe(world: Map, keyframe: Keyframe, weighing: Weighing, mapper: BackgroundMapper | None = None) -> None:
+    """Take a tracked keyframe into the map and put its neighbourhood in order; with a mapper, the sums come later."""
     world.add_keyframe(keyframe)
     add_points(world, keyframe)
     if len(world.keyframes) == 1:
         return
     fuse(world, keyframe)
-    adjust_window(world, keyframe, weighing)
+    if mapper is None:
+        adjust_window(world, keyframe, weighing)
+    else:
+        mapper.start(world, keyframe)
     cull(world, keyframe.index)
 
 
@@ -61,39 +63,8 @@ def _merge(world: Map, first: NDArray[np.int64], second: NDArray[np.int64], keyf
 
 def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
     """Bundle-adjust the newest keyframe with those that share most points; measurements that do not fit are dropped."""
-    window = world.covisible(keyframe.seen_points(), WINDOW)
-    window.sort(key=lambda k: k.index)
-    fixed = max(1, min(FIXED, len(window) // 4))
-    problem, ids, corners = _problem(world, window, fixed)
-    poses, points = np.stack([k.T_cw for k in window]), world.positions[ids]
-    poses, points = adjust(poses, points, problem, weighing, steps=5)
-    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
-    poses, points = adjust(poses, points, problem.take(good), weighing, steps=3, robust=False)
-    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
-    world.positions[ids] = points
-    for slot, member in enumerate(window):
-        member.T_cw = poses[slot]
-        world.forget(member, corners[(problem.cameras == slot) & ~good])
-
-
-def _problem(world: Map, window: list[Keyframe], fixed: int) -> tuple[Problem, NDArray[np.int64], NDArray[np.int64]]:
-    """The window's measurements, the ids of its points, and the corner behind every measurement."""
-    ids = world.points_of(window[fixed:])
-    row = np.full(world.size + 1, -1)
-    row[ids] = np.arange(len(ids))
-    corners = [np.flatnonzero(row[k.point_ids] >= 0) for k in window]
-    seen = [observations(k.features, c, world.trust(k.point_ids[c])) for k, c in zip(window, corners, strict=True)]
-    problem = Problem(
-        cameras=np.repeat(np.arange(len(window)), [len(c) for c in corners]),
-        points=np.concatenate([row[k.point_ids[c]] for k, c in zip(window, corners, strict=True)]),
-        seen=Observations(
-            np.concatenate([s.pixels for s in seen]),
-            np.concatenate([s.depths for s in seen]),
-            np.concatenate([s.sigmas for s in seen]),
-        ),
-        free=np.arange(len(window)) >= fixed,
-    )
-    return problem, ids, np.concatenate(corners)
+    window = open_window(world, keyframe)
+    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))
 
 
 def cull(world: Map, newest: int) -> None:

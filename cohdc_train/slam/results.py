@@ -33,9 +33,12 @@ class FrameRecord:
     depth_ms: float = 0.0
 
 
-def measure(records: list[FrameRecord], trajectory: Trajectory, groundtruth: Path | None) -> dict[str, Any]:
+def measure(
+    records: list[FrameRecord], trajectory: Trajectory, groundtruth: Path | None, dropped: int = 0
+) -> dict[str, Any]:
     """The numbers of metrics.json but the seed.
 
+    dropped: frames that came while the tracker was busy and have no record; they count as frames without a pose.
     `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map` over keyframes only, `depth` of
     stereo pairs only; `fps` is frames over the time of all stages. Raises DataError when the ground truth's file is
     broken.
@@ -50,19 +53,20 @@ def measure(records: list[FrameRecord], trajectory: Trajectory, groundtruth: Pat
     tracked = sum(pose.tracked for pose in poses)
     busy = sum(sum(row) for row in times.values())
     result: dict[str, Any] = {
-        "frames": len(poses),
+        "frames": len(poses) + dropped,
         "tracked": tracked,
-        "coverage": tracked / len(poses),
+        "coverage": tracked / (len(poses) + dropped),
         "keyframes": sum(pose.keyframe for pose in poses),
         "fps": 1e3 * len(poses) / busy,
-        "ms": {stage: _quantiles(row) for stage, row in times.items()},
+        "ms": {stage: quantiles(row) for stage, row in times.items()},
     }
     if groundtruth is not None and tracked >= 3:
         result.update(score(read_tum(groundtruth), trajectory))
     return result
 
 
-def _quantiles(values: list[float]) -> dict[str, float]:
+def quantiles(values: list[float]) -> dict[str, float]:
+    """p50 and p95; 0 where there is no value."""
     array = np.array(values or [0.0])
     return {"p50": float(np.quantile(array, 0.5)), "p95": float(np.quantile(array, 0.95))}
 

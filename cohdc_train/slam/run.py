@@ -1,8 +1,6 @@
 """`cohdc slam`: an RGB-D sequence in, a trajectory and its scores out."""
 
-import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -10,35 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera, choose_camera
-from cohdc_train.slam.culling import Culling, FolderMasks, MaskSource, ModelMasks, no_masks
-from cohdc_train.slam.features import FeatureExtractor
-from cohdc_train.slam.live import Followed, LiveSource, stopped_by_ctrl_c
+from cohdc_train.slam.culling import Culling, FolderMasks, ModelMasks, no_masks
+from cohdc_train.slam.live import Followed, stopped_by_ctrl_c
 from cohdc_train.slam.map_files import MapFiles
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.results import (
-    FrameRecord,
-    check_out,
-    draw_after,
-    draw_before,
-    measure,
-    publish,
-    write_jpeg,
-    write_run,
-)
-from cohdc_train.slam.source import Recorded, Source, View, rgbd_layout
+from cohdc_train.slam.playback import play
+from cohdc_train.slam.realtime import workers
+from cohdc_train.slam.results import check_out, measure, publish, write_run
+from cohdc_train.slam.source import Recorded, Source, rgbd_layout
 from cohdc_train.slam.stereo import stereo_layout
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.viewer import Viewer
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory
-
-_PICTURES = 6
 
 
 def slam(
@@ -52,6 +38,7 @@ def slam(
     features: int = 1000,
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
     method: Method = Method(),  # noqa: B008 - the same
+    realtime: bool = False,
     cloud: bool = False,
     follow: bool = False,
     idle: float = 10.0,
@@ -75,6 +62,8 @@ def slam(
         features: corners per frame.
         culling: how masks are made.
         method: which parts of the method run.
+        realtime: frames come at the pace of their stamps, one that is late is dropped and counted; masks and mapping
+            are made beside tracking. Then the numbers depend on the machine.
         cloud: write cloud.ply too, the dense coloured points of all that stands still.
         follow: the sequence is still being written: take frames as its lists grow.
         idle: s without a new frame after which a followed sequence has ended; a file named done there ends it, too.
@@ -92,6 +81,7 @@ def slam(
         features=features,
         culling=culling,
         method=method,
+        realtime=realtime,
         cloud=cloud,
         view=view,
         rrd=rrd,
@@ -109,6 +99,7 @@ def run_source(
     features: int = 1000,
     culling: Culling | None = None,
     method: Method | None = None,
+    realtime: bool = False,
     cloud: bool = False,
     view: bool = False,
     rrd: Path | None = None,
@@ -122,29 +113,31 @@ def run_source(
     """
     _check_options(out, model, masks)
     culling, method = culling or Culling(), method or Method()
-    mask_of = _mask_source(model, masks, source.camera, culling)
-    options = {"model": model, "masks": masks, "seed": seed, "features": features}
+    maker = _masks(model, masks, source.camera, culling, 1 if realtime else 0)
+    options = {"model": model, "masks": masks, "seed": seed, "features": features, "realtime": realtime}
     config: dict[str, Any] = {key: str(v) if isinstance(v, Path) else v for key, v in options.items()}
     config |= {"culling": asdict(culling), "method": asdict(method), "camera": source.camera.as_dict()}
     config |= {**(origin or {}), "version": __version__}
     with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         part = Path(folder)
-        tracker = Tracker(source.camera, features, seed, method)
         with ExitStack() as stack:
+            beside = stack.enter_context(workers(source, maker)) if realtime else None
+            tracker = Tracker(source.camera, features, seed, method, beside.executor if beside else None)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
             watchers = [files, *watchers]
             if view or rrd is not None:
                 watchers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
             stack.enter_context(stopped_by_ctrl_c(source))
-            records = _run(tracker, source, mask_of, part, watchers)
+            views, mask_of = (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
+            records = play(tracker, views, mask_of, part / "pictures", watchers)
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
-        metrics = {"seed": seed, "without_depth": source.without_depth, "loops": tracker.loops}
-        metrics |= measure(records, trajectory, source.groundtruth)
+        metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops, "without_depth": source.without_depth}
+        metrics |= measure(records, trajectory, source.groundtruth, beside.source.dropped if beside else 0)
+        metrics |= beside.metrics() if beside else {}
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
-    print(summary(metrics))
-    print(f"written to {out}")
+    print(f"{summary(metrics)}\nwritten to {out}")
     return metrics
 
 
@@ -156,7 +149,12 @@ def summary(metrics: dict[str, Any]) -> str:
         ("loops closed", str(metrics["loops"])),
         ("frames/s", f"{metrics['fps']:.1f}"),
     ]
-    rows += [(f"{stage} ms", f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for stage, q in metrics["ms"].items()]
+    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
+    if metrics["realtime"]:
+        rows.append(("dropped", str(metrics["dropped"])))
+        names = {"segmenter_ms": "segmenter ms", "mask_age_ms": "mask age ms", "latency_ms": "latency ms"}
+        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
+    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
     for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
         if key in metrics:
             rows.append((key, "  ".join(f"{name} {value:.4f}" for name, value in metrics[key].items())))
@@ -188,72 +186,17 @@ def _source(sequence: Path, camera: Path | None, follow: bool, idle: float) -> t
     return source, words
 
 
-def _mask_source(model: Path | None, masks: Path | None, camera: Camera, culling: Culling) -> MaskSource:
+def _masks(
+    model: Path | None, masks: Path | None, camera: Camera, culling: Culling, threads: int
+) -> FolderMasks | ModelMasks | None:
+    """threads: of the segmenter, 0 = as many as there are cores."""
     if masks is not None:
         return FolderMasks(masks, camera, culling)
     if model is None:
-        return no_masks
+        return None
     from cohdc_train.segmenter import Segmenter
 
-    return ModelMasks(Segmenter(model), culling)
-
-
-def _run(
-    tracker: Tracker, source: Source, mask_of: MaskSource, part: Path, watchers: Sequence[Watcher]
-) -> list[FrameRecord]:
-    (part / "pictures").mkdir()
-    count = len(source)
-    pictured = _pictured(count)
-    records: list[FrameRecord] = []
-    try:
-        for index, view in enumerate(source):
-            mask, record = _step(tracker, view, mask_of, part / "pictures" if index in pictured else None)
-            records.append(record)
-            for watcher in watchers:
-                watcher(view, mask, record, tracker)
-            _progress(index + 1, count, record)
-    except DataError as error:
-        if not records or not isinstance(source, LiveSource):
-            raise
-        print(f"ended: {error}", file=sys.stderr)  # what a live run has so far is not lost
-    if not records:
-        raise DataError("no frame came: nothing is written")
-    return records
-
-
-def _pictured(count: int) -> set[int]:
-    """Which frames are drawn; where nobody knows how many come, the first and then ever rarer ones."""
-    if count == 0:
-        return {0, *(30 << k for k in range(20))}
-    return set(np.linspace(0, count - 1, min(_PICTURES, count)).round().astype(int).tolist())
-
-
-def _step(
-    tracker: Tracker, view: View, mask_of: MaskSource, pictures: Path | None
-) -> tuple[NDArray[np.bool_] | None, FrameRecord]:
-    """One frame: its mask and what became of it; when it is to be pictured, the drawing stays outside the times."""
-    start = time.perf_counter()
-    mask = mask_of(view)
-    segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
-    pose = tracker.track(view.rgb, view.depth, view.t, mask, view.depth_t)
-    mask = tracker.mask
-    if pictures is not None and tracker.features is not None:
-        unmasked = FeatureExtractor(tracker.camera, tracker.budget)(view.rgb, view.depth)
-        write_jpeg(pictures / f"{view.stamp}_before.jpg", draw_before(view.rgb, unmasked, mask))
-        if mask is not None:
-            write_jpeg(pictures / f"{view.stamp}_after.jpg", draw_after(view.rgb, tracker.features, mask))
-    culled = 0.0 if mask is None else float(mask.mean())
-    return mask, FrameRecord(view.stamp, pose, culled, segment_ms, view.depth_ms)
-
-
-def _progress(done: int, count: int, record: FrameRecord) -> None:
-    """One line that renews itself on a terminal; elsewhere a line per tenth, or per hundred where no end is known."""
-    state = f"{record.pose.inliers} inliers" if record.pose.tracked else "lost"
-    line = f"frame {done}/{count}  {state}" if count else f"frame {done}  {state}"
-    if sys.stderr.isatty():
-        print(f"\r{line:<50}", end="\n" if done == count else "", file=sys.stderr, flush=True)
-    elif done % 100 == 0 if count == 0 else done * 10 // count > (done - 1) * 10 // count:
-        print(line, file=sys.stderr, flush=True)
+    return ModelMasks(Segmenter(model, threads), culling)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The tracker: every frame's pose against the map; decides on keyframes; finds the place again after a loss."""
 
 import time
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.alignment import Picture, take_picture
+from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.culling import grow
 from cohdc_train.slam.features import FeatureExtractor, Features
@@ -59,9 +61,19 @@ class _Fit:
 
 
 class Tracker:
-    """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit."""
+    """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit.
 
-    def __init__(self, camera: Camera, features: int = 1000, seed: int = 0, method: Method | None = None) -> None:
+    With an executor bundle adjustment runs there, beside tracking (`background_mapping`); poses then depend on time.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        features: int = 1000,
+        seed: int = 0,
+        method: Method | None = None,
+        executor: Executor | None = None,
+    ) -> None:
         self.camera = camera
         self.method = method or Method()
         self.map = Map(camera)
@@ -72,6 +84,7 @@ class Tracker:
         self._geometry = Geometry(camera)
         self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
+        self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._rng = np.random.default_rng(seed)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._velocity = np.eye(4)
@@ -97,6 +110,7 @@ class Tracker:
         depth_t: s, when depth was taken, where that differs from t.
         """
         start = time.perf_counter()
+        self._take_in_mapping()
         mask = self.mask = self._with_movers(mask, depth_m)
         features = self._extract(rgb, depth_m, mask, self._lag(t, depth_t))
         fit = self._locate(features, rgb)
@@ -116,6 +130,11 @@ class Tracker:
         mapped = time.perf_counter()
         T_wc = None if fit is None else np.linalg.inv(fit.T_cw).astype(np.float64)
         return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
+
+    def finish(self) -> None:
+        """Wait for mapping that runs beside tracking; the trajectory is better for it."""
+        if self._mapper is not None:
+            self._mapper.finish(self.map)
 
     @property
     def loops(self) -> int:
@@ -165,6 +184,12 @@ class Tracker:
         if rough is None:
             return self._relocalise(features, rgb)
         return self._against_local_map(features, rough, _MIN_TRACKED)
+
+    def _take_in_mapping(self) -> None:
+        """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
+        motion = None if self._mapper is None else self._mapper.collect(self.map)
+        if motion is not None and self._last is not None:
+            self._last = _Fit(self._last.T_cw @ motion, self._last.matches)
 
     def _follow(self, features: Features, last: _Fit) -> _Fit | None:
         """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
@@ -244,7 +269,7 @@ class Tracker:
         point_ids[fit.matches.corners] = fit.matches.points
         pictures = thumbnail(rgb), self._geometry.nearest(depth_m)
         keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, *pictures)
-        insert_keyframe(self.map, keyframe, self._weighing)
+        insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
         if self._refiner is not None and pyramid is not None:
             self._refiner.remember(keyframe, pyramid)
         self._reference = keyframe

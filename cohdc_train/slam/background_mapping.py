@@ -1,0 +1,72 @@
+"""Local bundle adjustment beside tracking, so that tracking never waits for it.
+
+No two threads ever touch the map. The tracker's thread takes arrays out of it (`open_window`), a worker process does
+the sums on its own copy, and the tracker's thread, between two frames, puts the result in (`close_window`). One window
+is under way at a time; a keyframe that joins meanwhile waits, and a newer one takes its place.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+
+import numpy as np
+
+from cohdc_train.slam.map import Keyframe, Map
+from cohdc_train.slam.optimization import Array, Weighing
+from cohdc_train.slam.window import Solution, Window, close_window, open_window, solve
+
+_NICE = 5  # the worker gives way to tracking when there are fewer cores than work
+
+
+class BackgroundMapper:
+    """Bundle adjustments, one after the other, in an executor."""
+
+    def __init__(self, executor: Executor, weighing: Weighing) -> None:
+        self._executor = executor
+        self._weighing = weighing
+        self._running: tuple[Window, Future[Solution]] | None = None
+        self._waiting: Keyframe | None = None
+
+    def start(self, world: Map, keyframe: Keyframe) -> None:
+        """Adjust the keyframe's window as soon as the one under way is done."""
+        if self._running is not None:
+            self._waiting = keyframe
+            return
+        window = open_window(world, keyframe)
+        poses = np.stack(window.poses)
+        job = self._executor.submit(solve, poses, window.points, window.problem, self._weighing)
+        self._running = window, job
+
+    def collect(self, world: Map) -> Array | None:
+        """Put a finished result into the map. Returns the motion of `close_window`, None when there is none."""
+        if self._running is None or not self._running[1].done():
+            return None
+        window, job = self._running
+        motion = close_window(world, window, job.result())
+        self._running, waiting = None, self._waiting
+        self._waiting = None
+        if waiting is not None:
+            self.start(world, waiting)
+        return motion
+
+    def finish(self, world: Map) -> None:
+        """Wait for what is under way and what waits, and put it into the map."""
+        while self._running is not None:
+            self._running[1].result()
+            self.collect(world)
+
+
+@contextmanager
+def worker_process() -> Iterator[Executor]:
+    """One process, ready to work, that gives way to its parent."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as executor:
+        executor.submit(_give_way).result()
+        yield executor
+
+
+def _give_way() -> None:
+    if hasattr(os, "nice"):
+        os.nice(_NICE)

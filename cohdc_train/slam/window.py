@@ -1,0 +1,100 @@
+"""Local bundle adjustment of a window of keyframes in three steps: the map's arrays out, the sums, the result back in.
+
+The middle step touches no map, so it may run elsewhere and later (`background_mapping`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.bundle_adjustment import Problem, adjust, measurement_chi2
+from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.optimization import Array, Observations, Weighing, to_local
+
+WINDOW = 12  # keyframes in local bundle adjustment
+FIXED = 3  # of them hold still and carry the frame of reference
+
+
+@dataclass(frozen=True)
+class Window:
+    """What a bundle adjustment starts from.
+
+    keyframes: [c] the newest last; poses: [c, 4, 4] T_cw, m, as they were; ids: [p] map points; points: [p, 3] world,
+    m, as they were; problem: m measurements; corners: [m] the keyframe's corner behind each; size: of the map then.
+    """
+
+    keyframes: list[Keyframe]
+    poses: list[Array]
+    ids: NDArray[np.int64]
+    points: Array
+    problem: Problem
+    corners: NDArray[np.int64]
+    size: int
+
+
+@dataclass(frozen=True)
+class Solution:
+    """poses: [c, 4, 4] T_cw, m; points: [p, 3] world, m; good: [m] bool, measurements that fit."""
+
+    poses: Array
+    points: Array
+    good: NDArray[np.bool_]
+
+
+def open_window(world: Map, keyframe: Keyframe) -> Window:
+    """The keyframe with those that share most points, and their measurements."""
+    keyframes = world.covisible(keyframe.seen_points(), WINDOW)
+    keyframes.sort(key=lambda k: k.index)
+    fixed = max(1, min(FIXED, len(keyframes) // 4))
+    ids = world.points_of(keyframes[fixed:])
+    row = np.full(world.size + 1, -1)
+    row[ids] = np.arange(len(ids))
+    corners = [np.flatnonzero(row[k.point_ids] >= 0) for k in keyframes]
+    seen = [observations(k.features, c, world.trust(k.point_ids[c])) for k, c in zip(keyframes, corners, strict=True)]
+    problem = Problem(
+        cameras=np.repeat(np.arange(len(keyframes)), [len(c) for c in corners]),
+        points=np.concatenate([row[k.point_ids[c]] for k, c in zip(keyframes, corners, strict=True)]),
+        seen=Observations(
+            np.concatenate([s.pixels for s in seen]),
+            np.concatenate([s.depths for s in seen]),
+            np.concatenate([s.sigmas for s in seen]),
+        ),
+        free=np.arange(len(keyframes)) >= fixed,
+    )
+    poses = [k.T_cw for k in keyframes]
+    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(corners), world.size)
+
+
+def solve(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Solution:
+    """Robustly first, then once more without the measurements that do not fit. Arrays as in `Window`."""
+    poses, points = adjust(poses, points, problem, weighing, steps=5)
+    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
+    poses, points = adjust(poses, points, problem.take(good), weighing, steps=3, robust=False)
+    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
+    return Solution(poses, points, good)
+
+
+def close_window(world: Map, window: Window, solution: Solution) -> Array | None:
+    """Put a solution into the map; measurements that do not fit are dropped.
+
+    The map may have grown since the window was opened: what was added moves along with the window's newest keyframe.
+    Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and nothing is done, when
+    somebody else moved one of the keyframes in the meantime (a loop was closed).
+    """
+    if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=True)):
+        return None
+    motion: Array = np.linalg.inv(window.poses[-1]) @ solution.poses[-1]
+    newest = window.keyframes[-1].index
+    for later in world.keyframes[newest + 1 :]:
+        later.T_cw = later.T_cw @ motion
+    added = slice(window.size, world.size)
+    back = np.asarray(np.linalg.inv(motion), dtype=np.float64)
+    world.positions[added] = to_local(back, world.positions[added])
+    world.positions[window.ids] = solution.points
+    for slot, member in enumerate(window.keyframes):
+        member.T_cw = solution.poses[slot]
+        rows = (window.problem.cameras == slot) & ~solution.good
+        corners, ids = window.corners[rows], window.ids[window.problem.points[rows]]
+        world.forget(member, corners[member.point_ids[corners] == ids])
+    return motion

@@ -1,0 +1,111 @@
+"""Masks carried by flow and depth: squares whose every move is known."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from plane_world import texture
+
+from cohdc_train.slam.propagation import Half, Mask, Propagation, cut_by_depth, halve, halve_mask
+
+HEIGHT, WIDTH = 240, 320
+WALL, PERSON = 3.0, 1.5  # m
+_WALLPAPER = texture(np.random.default_rng(1), HEIGHT, WIDTH)
+_SHIRT = texture(np.random.default_rng(2), 100, 80, patches=200)
+
+
+def scene(left: int, depth: float = PERSON) -> tuple[Half, Mask]:
+    """A textured board, 80 x 100 px, its left edge at `left`, before a wall. Returns the frame and the true mask."""
+    rgb, metres = _WALLPAPER.copy(), np.full((HEIGHT, WIDTH), WALL, dtype=np.float32)
+    mask = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
+    begin, end = max(left, 0), min(left + 80, WIDTH)
+    rgb[70:170, begin:end] = _SHIRT[:, begin - left : end - left]
+    metres[70:170, begin:end] = depth
+    mask[70:170, begin:end] = True
+    return halve(rgb, metres), halve_mask(mask)
+
+
+def iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
+    return float((first & second).sum() / (first | second).sum())
+
+
+def test_a_mask_follows_the_square_it_was_made_for() -> None:
+    propagation = Propagation()
+    frame, mask = scene(100)
+    propagation.renew(mask, propagation.advance(frame), frame)
+    for step in range(1, 7):
+        frame, truth = scene(100 + 6 * step)
+        propagation.advance(frame)
+        carried = propagation.mask()
+        assert carried is not None
+        assert iou(carried, truth) > 0.95
+    assert iou(mask, truth) < 0.5, "the old mask is far off by then"
+
+
+def test_a_late_mask_is_carried_through_the_frames_that_passed() -> None:
+    propagation = Propagation()
+    first, mask = scene(100)
+    number = propagation.advance(first)
+    for step in range(1, 7):
+        frame, truth = scene(100 + 6 * step)
+        propagation.advance(frame)
+    assert propagation.mask() is None, "nothing is known before the first mask"
+    propagation.renew(mask, number, first)
+    carried = propagation.mask()
+    assert carried is not None
+    assert iou(carried, truth) > 0.95
+
+
+def test_a_mask_older_than_the_memory_takes_one_leap() -> None:
+    propagation = Propagation()
+    first, mask = scene(100)
+    number = propagation.advance(first)
+    for _ in range(60):
+        propagation.advance(scene(112)[0])
+    propagation.renew(mask, number, first)
+    carried = propagation.mask()
+    assert carried is not None
+    assert iou(carried, scene(112)[1]) > 0.95
+    assert len(propagation._frames) < 60, "memory is bounded"
+
+
+def test_a_person_cut_by_the_border_walks_in_masked() -> None:
+    propagation = Propagation()
+    frame, mask = scene(-40)
+    propagation.renew(mask, propagation.advance(frame), frame)
+    for left in range(-36, 1, 4):
+        frame, truth = scene(left)
+        propagation.advance(frame)
+    carried = propagation.mask()
+    assert carried is not None
+    assert (carried & truth).sum() > 0.9 * truth.sum()
+
+
+def test_the_depth_gate_lets_go_what_is_not_as_deep_any_more() -> None:
+    propagation = Propagation()
+    frame, mask = scene(100)
+    propagation.renew(mask, propagation.advance(frame), frame)
+    propagation.advance(scene(100, depth=PERSON + 0.2)[0])
+    kept = propagation.mask()
+    assert kept is not None
+    assert iou(kept, mask) > 0.95
+    propagation.advance(scene(100, depth=WALL)[0])
+    gone = propagation.mask()
+    assert gone is not None
+    assert not gone.any()
+
+
+@pytest.mark.parametrize("off", [-2, 2], ids=["too small", "too large"])
+def test_a_masks_edge_goes_to_where_depth_breaks(off: int) -> None:
+    depth = np.full((120, 160), WALL, dtype=np.float32)
+    depth[40:80, 50:90] = PERSON
+    truth = depth < 2
+    rough = np.zeros_like(truth)
+    rough[40 - off : 80 + off, 50 - off : 90 + off] = True
+    cut = cut_by_depth(rough, depth)
+    assert iou(cut, truth) > 0.98 > iou(rough, truth) + 0.05
+
+
+def test_pixels_without_depth_stay_as_they_are() -> None:
+    mask = np.zeros((120, 160), dtype=np.bool_)
+    mask[40:80, 50:90] = True
+    np.testing.assert_array_equal(cut_by_depth(mask, np.zeros((120, 160), dtype=np.float32)), mask)
