@@ -23,6 +23,7 @@ _FAR = 5.0  # m: nor anything reliable further off
 _VOTES = 2  # keyframes that must have looked through the place
 _LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
 _GROWTH, _SAME = 3, 0.12  # coarse px a mover grows over its own surface, and m its depth may change per px
+_JUDGED, _MOVED = 0.6, 0.05  # of a part at rest: readings that agree, at least, and that do not, at most
 _MOST = 0.8  # of the readings: so many movers mean that the pose is wrong
 
 Coarse = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
@@ -45,6 +46,7 @@ class Geometry:
         self._shape = (camera.height // _STEP, camera.width // _STEP)
         coarse = _STEP * _grid(*self._shape) + _CENTRE
         self._rays = camera.backproject(coarse, np.ones(len(coarse)))
+        self._blocks = _maps(camera.distort(coarse), self._shape)  # where each coarse pixel is measured, px
         self._measured = _maps((camera.distort(coarse) - _CENTRE) / _STEP, self._shape)
         whole = (camera.height, camera.width)
         self._flat = _maps((camera.undistort(_grid(*whole)) - _CENTRE) / _STEP, whole)
@@ -61,6 +63,26 @@ class Geometry:
         if not found.any() or np.count_nonzero(found) > _MOST * np.count_nonzero(image):
             return np.zeros(depth.shape, dtype=np.bool_)
         return np.asarray(cv2.remap(found.astype(np.float32), *self._flat, cv2.INTER_LINEAR) > 0.5)
+
+    def at_rest(
+        self, mask: NDArray[np.bool_], depth: NDArray[np.float32], T_cw: Array, references: list[Reference]
+    ) -> NDArray[np.bool_]:
+        """The connected parts of a mask [H, W] that lie where every reference that could see them saw a surface.
+
+        Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told from rest.
+        """
+        image = self._coarse(depth)
+        through, agrees = self._votes(image, T_cw, references)
+        _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+        coarse = cv2.remap(parts.astype(np.float32), *self._blocks, cv2.INTER_NEAREST).astype(np.int64)
+        count = int(parts.max()) + 1
+        readings, still, moved = (
+            np.bincount(coarse[chosen], minlength=count)
+            for chosen in (image > 0, (agrees > 0) & (through == 0), through > 0)
+        )
+        rests = (still >= np.maximum(_JUDGED * readings, _LEAST)) & (moved <= _MOVED * still)
+        rests[0] = False
+        return np.asarray(rests[parts])
 
     def _coarse(self, depth: NDArray[np.float32]) -> Coarse:
         """The least reading of every block, 0 where less than half of it has one."""

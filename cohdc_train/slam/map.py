@@ -23,7 +23,8 @@ class Keyframe:
     """A frame the map keeps.
 
     index: place in the map's list; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n] int64, the map point of every
-    corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the place again.
+    corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the place again; nearest: [h, w]
+    coarse depth as Geometry.nearest gives it, m.
     """
 
     index: int

@@ -11,30 +11,22 @@ from numpy.typing import NDArray
 from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.culling import grow
+from cohdc_train.slam.dynamic_mask import dynamic_mask_of
 from cohdc_train.slam.features import FeatureExtractor, Features
-from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.geometry import Geometry
+from cohdc_train.slam.localization import LOCAL_KEYFRAMES, Fit, Localizer, thumbnail
 from cohdc_train.slam.loop_closing import LoopCloser
-from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.mapping import insert_keyframe
-from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
+from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, log_se3, optimize_pose
-from cohdc_train.slam.ransac import ransac_pose
+from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse, log_se3
 from cohdc_train.slam.refinement import Pyramid, Refiner
-from cohdc_train.slam.rigidity import pose_of_rest
 
 _MIN_START = 50  # points a first keyframe needs
-_MIN_FIRST = 15  # inliers of the first, rough pose
-_MIN_TRACKED = 25  # inliers of the pose against the local map
-_MIN_FOUND_AGAIN = 40  # the same when the place was lost
-_LOCAL_KEYFRAMES = 15
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
 _KEYFRAME_FRAMES = 20
-_REFERENCES = 8  # keyframes whose depth a frame is held against
-_MOVER_BAND = 8.0  # px: as wide as a coarse pixel of that
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
-_CANDIDATES = 6  # keyframes tried per lost frame
 
 
 @dataclass(frozen=True)
@@ -52,12 +44,6 @@ class Pose:
     def tracked(self) -> bool:
         """Whether the frame has a pose."""
         return self.T_wc is not None
-
-
-@dataclass(frozen=True)
-class _Fit:
-    T_cw: Array
-    matches: Matches
 
 
 class Tracker:
@@ -85,11 +71,10 @@ class Tracker:
         self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
-        self._rng = np.random.default_rng(seed)
+        self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._velocity = np.eye(4)
-        self._last: _Fit | None = None
-        self._reference: Keyframe | None = None
+        self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
         self._log: list[tuple[float, Keyframe, Array]] = []  # stamp, reference keyframe, T of the frame in it
@@ -111,7 +96,7 @@ class Tracker:
         """
         start = time.perf_counter()
         self._take_in_mapping()
-        mask = self.mask = self._with_movers(mask, depth_m)
+        mask = self.mask = self._dynamic(mask, depth_m, t)
         features = self._extract(rgb, depth_m, mask, self._lag(t, depth_t))
         fit = self._locate(features, rgb)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
@@ -128,7 +113,7 @@ class Tracker:
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
-        T_wc = None if fit is None else np.linalg.inv(fit.T_cw).astype(np.float64)
+        T_wc = None if fit is None else inverse(fit.T_cw)
         return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
 
     def finish(self) -> None:
@@ -147,22 +132,17 @@ class Tracker:
         Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
         """
         stamps = np.array([t for t, _, _ in self._log])
-        poses = [np.linalg.inv(relative @ keyframe.T_cw) for _, keyframe, relative in self._log]
+        poses = [inverse(relative @ keyframe.T_cw) for _, keyframe, relative in self._log]
         return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
 
-    def _with_movers(self, mask: NDArray[np.bool_] | None, depth_m: NDArray[np.float32]) -> NDArray[np.bool_] | None:
-        """The mask, and what depth says moves where the camera is expected."""
+    def _dynamic(
+        self, mask: NDArray[np.bool_] | None, depth_m: NDArray[np.float32], t: float
+    ) -> NDArray[np.bool_] | None:
+        """The mask after depth had its say, where the camera is expected."""
         if not self.method.geometry or self._last is None:
             return mask
-        around = self.map.covisible(self._last.matches.points, _LOCAL_KEYFRAMES)
-        around.sort(key=lambda keyframe: keyframe.index)
-        spread = np.unique(np.linspace(0, len(around) - 1, _REFERENCES).round().astype(int)).tolist()
-        references = [Reference(around[i].T_cw, around[i].nearest) for i in spread]
-        movers = self._geometry.movers(depth_m, self._velocity @ self._last.T_cw, references)
-        if not movers.any():
-            return mask
-        movers = grow(movers, _MOVER_BAND)
-        return movers if mask is None else mask | movers
+        around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
+        return dynamic_mask_of(self._geometry, mask, depth_m, self._velocity @ self._last.T_cw, around, t)
 
     def _lag(self, t: float, depth_t: float | None) -> Array | None:
         """[4, 4] from the camera's frame at t to that at depth_t, by the velocity between the last two frames."""
@@ -173,86 +153,22 @@ class Tracker:
             return None
         return exp_se3(log_se3(self._velocity) * ((depth_t - t) / step))
 
-    def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> _Fit | None:
+    def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
-            return _Fit(np.eye(4), Matches(empty, empty)) if usable >= _MIN_START else None
+            return Fit(np.eye(4), Matches(empty, empty)) if usable >= _MIN_START else None
         if self._last is None:
-            return self._relocalise(features, rgb)
-        rough = self._follow(features, self._last)
-        if rough is None:
-            return self._relocalise(features, rgb)
-        return self._against_local_map(features, rough, _MIN_TRACKED)
+            return self._localizer.anywhere(features, rgb)
+        return self._localizer.near(features, rgb, self._last, self._velocity)
 
     def _take_in_mapping(self) -> None:
         """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
         motion = None if self._mapper is None else self._mapper.collect(self.map)
         if motion is not None and self._last is not None:
-            self._last = _Fit(self._last.T_cw @ motion, self._last.matches)
+            self._last = Fit(self._last.T_cw @ motion, self._last.matches)
 
-    def _follow(self, features: Features, last: _Fit) -> _Fit | None:
-        """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
-        for guess, radius in ((self._velocity @ last.T_cw, 15.0), (last.T_cw, 40.0)):
-            projected = self.map.project(last.matches.points, guess)
-            matches = match_projected(projected, features, radius)
-            fit = self._solve(features, matches, guess, hypotheses=64)
-            if fit is not None:
-                return fit
-        return None
-
-    def _solve(self, features: Features, matches: Matches, guess: Array | None, hypotheses: int) -> _Fit | None:
-        if len(matches) < _MIN_FIRST:
-            return None
-        points, seen = self._seen(features, matches)
-        found = ransac_pose(points, seen, self.camera, self._rng, hypotheses, guess=guess)
-        if found is None or found[1].sum() < _MIN_FIRST:
-            return None
-        T_cw, agree = found
-        matches = matches.take(agree)
-        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing, rounds=1)
-        return _Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
-
-    def _against_local_map(self, features: Features, rough: _Fit, minimum: int) -> _Fit | None:
-        """The final pose, from all points of the keyframes around."""
-        keyframes = self.map.covisible(rough.matches.points, _LOCAL_KEYFRAMES)
-        projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
-        matches = match_projected(projected, features, radius=5.0)
-        points, seen = self._seen(features, matches)
-        if self.method.static_weights:
-            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing)
-            self.map.judge(matches.points[inlier], matches.points[moving])
-        else:
-            T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
-        if inlier.sum() < minimum:
-            return None
-        matches = matches.take(inlier)
-        self.map.visible[projected.ids] += 1
-        self.map.found[matches.points] += 1
-        best = self.map.covisible(matches.points, 1)
-        self._reference = best[0]
-        return _Fit(T_cw, matches)
-
-    def _seen(self, features: Features, matches: Matches) -> tuple[Array, Observations]:
-        """Where the map has the matched points, [m, 3] m, and what the frame measured of them."""
-        seen = observations(features, matches.corners, self.map.trust(matches.points))
-        return self.map.positions[matches.points], seen
-
-    def _relocalise(self, features: Features, rgb: NDArray[np.uint8]) -> _Fit | None:
-        """Try the keyframes that look most like the frame, and the newest."""
-        picture = thumbnail(rgb)
-        likeness = np.array([float((k.thumbnail * picture).sum()) for k in self.map.keyframes])
-        order = [*np.argsort(-likeness, kind="stable")[: _CANDIDATES - 1], len(likeness) - 1]
-        for index in dict.fromkeys(int(i) for i in order):
-            ids = self.map.keyframes[index].seen_points()
-            matches = match_descriptors(ids, self.map.descriptors[ids], features)
-            rough = self._solve(features, matches, None, hypotheses=256)
-            fit = None if rough is None else self._against_local_map(features, rough, _MIN_FOUND_AGAIN)
-            if fit is not None:
-                return fit
-        return None
-
-    def _wants_keyframe(self, fit: _Fit) -> bool:
+    def _wants_keyframe(self, fit: Fit) -> bool:
         if not self.map.keyframes:
             return True
         if self._since_keyframe >= _KEYFRAME_FRAMES:
@@ -260,8 +176,8 @@ class Tracker:
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
     def _add_keyframe(
-        self, features: Features, fit: _Fit, t: float, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
-    ) -> _Fit:
+        self, features: Features, fit: Fit, t: float, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
+    ) -> Fit:
         pyramid = Pyramid(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)) if self._refiner else None
         if self._refiner is not None and pyramid is not None:
             features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
@@ -272,42 +188,33 @@ class Tracker:
         insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
         if self._refiner is not None and pyramid is not None:
             self._refiner.remember(keyframe, pyramid)
-        self._reference = keyframe
         self._since_keyframe = 0
         self._reference_inliers = 0
         return _fit_of(keyframe)
 
-    def _close_loop(self, fit: _Fit, loops: LoopCloser, picture: Picture) -> _Fit:
+    def _close_loop(self, fit: Fit, loops: LoopCloser, picture: Picture) -> Fit:
         """The newest keyframe's fit; after a loop the last frame's pose goes along, so that the velocity stays."""
         keyframe = self.map.keyframes[-1]
         if not loops.close(keyframe, picture):
             return fit
         if self._last is not None:
-            moved = self._last.T_cw @ np.linalg.inv(fit.T_cw) @ keyframe.T_cw
-            self._last = _Fit(moved, self._last.matches)
+            moved = self._last.T_cw @ inverse(fit.T_cw) @ keyframe.T_cw
+            self._last = Fit(moved, self._last.matches)
         return _fit_of(keyframe)
 
-    def _remember(self, fit: _Fit | None, t: float) -> None:
-        if fit is None or self._reference is None:
+    def _remember(self, fit: Fit | None, t: float) -> None:
+        if fit is None or fit.reference is None:
             self._last = None
             self._velocity = np.eye(4)
             return
-        self._velocity = np.eye(4) if self._last is None else fit.T_cw @ np.linalg.inv(self._last.T_cw)
+        self._velocity = np.eye(4) if self._last is None else fit.T_cw @ inverse(self._last.T_cw)
         self._last = fit
         if self._since_keyframe > 0:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
-        self._log.append((t, self._reference, fit.T_cw @ np.linalg.inv(self._reference.T_cw)))
+        self._log.append((t, fit.reference, fit.T_cw @ inverse(fit.reference.T_cw)))
 
 
-def _fit_of(keyframe: Keyframe) -> _Fit:
+def _fit_of(keyframe: Keyframe) -> Fit:
     corners = np.flatnonzero(keyframe.point_ids >= 0)
-    return _Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners))
-
-
-def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """[30, 40] float32, blurred, zero mean and unit norm: the product of two is their normalised correlation."""
-    small = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (40, 30), interpolation=cv2.INTER_AREA)
-    image = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5)
-    image -= image.mean()
-    return np.asarray(image / (np.linalg.norm(image) + 1e-6), dtype=np.float32)
+    return Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners), keyframe)

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.dynamic_mask import dynamic_mask_of
 from cohdc_train.slam.features import FeatureExtractor
 from cohdc_train.slam.geometry import Geometry, Reference
-from cohdc_train.slam.map import Map
+from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, optimize_pose
 from cohdc_train.slam.rigidity import moving_group, pose_of_rest
@@ -64,6 +65,44 @@ def test_what_stands_where_keyframes_looked_through_moves(camera: Camera) -> Non
 )
 def test_what_says_nothing_of_movement_is_left_alone(now: Depth, before: list[Depth]) -> None:
     assert not found(CAMERA, now, before).any()
+
+
+def boxes(*lefts: int) -> NDArray[np.bool_]:
+    """Masks of boxes, a little wider than they are."""
+    mask = np.zeros((240, 320), dtype=np.bool_)
+    for left in lefts:
+        mask[72:168, left - 8 : left + 88] = True
+    return mask
+
+
+def test_a_masked_thing_that_has_stood_still_is_told_from_one_that_came() -> None:
+    before, geometry = with_box(wall(), 30, 1.5), Geometry(CAMERA)
+    now = with_box(before, 200, 1.5)
+    references = [Reference(STILL, geometry.nearest(before))] * 3
+    rests = geometry.at_rest(boxes(30, 200), now, STILL, references)
+    np.testing.assert_array_equal(rests, boxes(30))
+    assert not geometry.at_rest(boxes(30, 200), np.zeros_like(now), STILL, references).any(), "no depth, no verdict"
+
+
+def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
+    geometry, box = Geometry(CAMERA), with_box(wall(), 30, 1.5)
+    seen = [keyframe(0, 10.0, geometry.nearest(box)), keyframe(1, 10.5, geometry.nearest(box))]
+
+    def mask_at(t: float, depth: Depth) -> NDArray[np.bool_] | None:
+        return dynamic_mask_of(geometry, boxes(30), depth, STILL, seen, t)
+
+    np.testing.assert_array_equal(mask_at(11.0, box), boxes(30))
+    assert not np.any(mask_at(13.0, box))
+    came = mask_at(13.0, with_box(box, 200, 1.5))
+    assert came is not None
+    assert came[90:150, 210:270].all()
+    assert not came[:, :100].any()
+    assert dynamic_mask_of(geometry, None, box, STILL, seen, 13.0) is None
+
+
+def keyframe(index: int, t: float, nearest: Depth) -> Keyframe:
+    nothing = FeatureExtractor(CAMERA, 10)(np.zeros((240, 320, 3), np.uint8), wall())
+    return Keyframe(index, t, STILL, nothing, np.zeros(0, dtype=np.int64), np.zeros((30, 40), np.float32), nearest)
 
 
 def test_the_camera_may_move() -> None:

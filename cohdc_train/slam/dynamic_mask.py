@@ -1,0 +1,39 @@
+"""A frame's mask as the tracker uses it: as given, without what has stood still, with what depth finds moving."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.culling import Mask, grow
+from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.map import Keyframe
+from cohdc_train.slam.optimization import Array
+
+_REFERENCES = 8  # keyframes whose depth a frame is held against
+_BAND = 8.0  # px: a coarse pixel's width, around what depth finds
+_RESTED = 2.0  # s that a masked thing must have stood still to be of use to tracking
+
+
+def dynamic_mask_of(
+    geometry: Geometry, mask: Mask | None, depth: NDArray[np.float32], T_cw: Array, around: list[Keyframe], t: float
+) -> Mask | None:
+    """mask, depth: [H, W], depth in m; T_cw: the frame's expected pose; around: keyframes that see the same place.
+
+    Returns [H, W] bool, True = dynamic; None where nothing was given and nothing moves.
+    """
+    around = sorted(around, key=lambda keyframe: keyframe.index)
+    references = [Reference(k.T_cw, k.nearest) for k in _spread(around)]
+    moves = grow(geometry.movers(depth, T_cw, references), _BAND)
+    if mask is None:
+        return moves if moves.any() else None
+    rested = [Reference(k.T_cw, k.nearest) for k in _spread([k for k in around if k.t <= t - _RESTED])]
+    if rested:
+        mask = mask & ~geometry.at_rest(mask, depth, T_cw, rested)
+    return mask | moves
+
+
+def _spread(keyframes: list[Keyframe]) -> list[Keyframe]:
+    """Some of them, evenly."""
+    if not keyframes:
+        return []
+    places = np.unique(np.linspace(0, len(keyframes) - 1, _REFERENCES).round().astype(int))
+    return [keyframes[i] for i in places.tolist()]

@@ -1,0 +1,114 @@
+"""The pose of one frame against the map: from the last pose, or from nothing when the place was lost."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.features import Features
+from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
+from cohdc_train.slam.optimization import Array, Observations, Weighing, optimize_pose
+from cohdc_train.slam.ransac import ransac_pose
+from cohdc_train.slam.rigidity import pose_of_rest
+
+LOCAL_KEYFRAMES = 15
+_MIN_FIRST = 15  # inliers of the first, rough pose
+_MIN_TRACKED = 25  # inliers of the pose against the local map
+_MIN_FOUND_AGAIN = 40  # the same when the place was lost
+_CANDIDATES = 6  # keyframes tried per lost frame
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference: the keyframe that
+    sees most of them, None while the pose is a rough one."""
+
+    T_cw: Array
+    matches: Matches
+    reference: Keyframe | None = None
+
+
+class Localizer:
+    """Finds frames in a map. judges: groups of points that move against the rest are left out and lose weight."""
+
+    def __init__(self, world: Map, weighing: Weighing, seed: int, judges: bool) -> None:
+        self.map = world
+        self._weighing = weighing
+        self._judges = judges
+        self._rng = np.random.default_rng(seed)
+
+    def near(self, features: Features, rgb: NDArray[np.uint8], last: Fit, velocity: Array) -> Fit | None:
+        """The frame after `last`. velocity: [4, 4], T_cw of the expected pose times the inverse of the last one's."""
+        rough = self._follow(features, last, velocity)
+        if rough is None:
+            return self.anywhere(features, rgb)
+        return self._against_local_map(features, rough, _MIN_TRACKED)
+
+    def anywhere(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
+        """Try the keyframes that look most like the frame, and the newest."""
+        picture = thumbnail(rgb)
+        likeness = np.array([float((k.thumbnail * picture).sum()) for k in self.map.keyframes])
+        order = [*np.argsort(-likeness, kind="stable")[: _CANDIDATES - 1], len(likeness) - 1]
+        for index in dict.fromkeys(int(i) for i in order):
+            ids = self.map.keyframes[index].seen_points()
+            matches = match_descriptors(ids, self.map.descriptors[ids], features)
+            rough = self._solve(features, matches, None, hypotheses=256)
+            fit = None if rough is None else self._against_local_map(features, rough, _MIN_FOUND_AGAIN)
+            if fit is not None:
+                return fit
+        return None
+
+    def _follow(self, features: Features, last: Fit, velocity: Array) -> Fit | None:
+        """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
+        for guess, radius in ((velocity @ last.T_cw, 15.0), (last.T_cw, 40.0)):
+            projected = self.map.project(last.matches.points, guess)
+            matches = match_projected(projected, features, radius)
+            fit = self._solve(features, matches, guess, hypotheses=64)
+            if fit is not None:
+                return fit
+        return None
+
+    def _solve(self, features: Features, matches: Matches, guess: Array | None, hypotheses: int) -> Fit | None:
+        if len(matches) < _MIN_FIRST:
+            return None
+        points, seen = self._seen(features, matches)
+        found = ransac_pose(points, seen, self.map.camera, self._rng, hypotheses, guess=guess)
+        if found is None or found[1].sum() < _MIN_FIRST:
+            return None
+        T_cw, agree = found
+        matches = matches.take(agree)
+        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing, rounds=1)
+        return Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
+
+    def _against_local_map(self, features: Features, rough: Fit, minimum: int) -> Fit | None:
+        """The final pose, from all points of the keyframes around."""
+        keyframes = self.map.covisible(rough.matches.points, LOCAL_KEYFRAMES)
+        projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
+        matches = match_projected(projected, features, radius=5.0)
+        points, seen = self._seen(features, matches)
+        if self._judges:
+            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing)
+            self.map.judge(matches.points[inlier], matches.points[moving])
+        else:
+            T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
+        if inlier.sum() < minimum:
+            return None
+        matches = matches.take(inlier)
+        self.map.visible[projected.ids] += 1
+        self.map.found[matches.points] += 1
+        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0])
+
+    def _seen(self, features: Features, matches: Matches) -> tuple[Array, Observations]:
+        """Where the map has the matched points, [m, 3] m, and what the frame measured of them."""
+        seen = observations(features, matches.corners, self.map.trust(matches.points))
+        return self.map.positions[matches.points], seen
+
+
+def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[30, 40] float32, blurred, zero mean and unit norm: the product of two is their normalised correlation."""
+    small = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (40, 30), interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5)
+    image -= image.mean()
+    return np.asarray(image / (np.linalg.norm(image) + 1e-6), dtype=np.float32)
