@@ -21,13 +21,16 @@ def dynamic_mask_of(
     Returns [H, W] bool, True = dynamic; None where nothing was given and nothing moves.
     """
     around = sorted(around, key=lambda keyframe: keyframe.index)
-    references = [Reference(k.T_cw, k.nearest) for k in _spread(around)]
-    moves = grow(geometry.movers(depth, T_cw, references), _BAND)
+    judges = _spread(around)
+    older = [] if mask is None else _spread([k for k in around if k.t <= t - _RESTED])
+    all_of_them = list({k.index: k for k in (*judges, *older)}.values())
+    row = {k.index: i for i, k in enumerate(all_of_them)}
+    comparison = geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
+    moves = grow(geometry.movers(comparison.only([row[k.index] for k in judges])), _BAND)
     if mask is None:
         return moves if moves.any() else None
-    rested = [Reference(k.T_cw, k.nearest) for k in _spread([k for k in around if k.t <= t - _RESTED])]
-    if rested:
-        mask = mask & ~geometry.at_rest(mask, depth, T_cw, rested)
+    if older:
+        mask = mask & ~geometry.at_rest(mask, comparison.only([row[k.index] for k in older]))
     return mask | moves
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.optimization import Array, inverse, to_local
+from cohdc_train.slam.optimization import Array, inverse
 
 _STEP = 8  # px of the image per coarse pixel
 _CENTRE = (_STEP - 1) / 2
@@ -38,6 +38,28 @@ class Reference:
     nearest: Coarse
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """A frame's depth held against k references.
+
+    image: Coarse, the frame's; through: [k, h, w] bool, the reference looked through the pixel's place; agrees:
+    [k, h, w] bool, it saw a surface there.
+    """
+
+    image: Coarse
+    through: NDArray[np.bool_]
+    agrees: NDArray[np.bool_]
+
+    def only(self, rows: list[int]) -> "Comparison":
+        """The same with some of the references."""
+        return Comparison(self.image, self.through[rows], self.agrees[rows])
+
+    @property
+    def still(self) -> NDArray[np.bool_]:
+        """[h, w] bool: a reference saw a surface there and none looked through."""
+        return np.asarray(self.agrees.any(axis=0) & ~self.through.any(axis=0))
+
+
 class Geometry:
     """The test for one camera. Depth images and masks are as measured, lens and all."""
 
@@ -45,74 +67,87 @@ class Geometry:
         self.camera = camera
         self._shape = (camera.height // _STEP, camera.width // _STEP)
         coarse = _STEP * _grid(*self._shape) + _CENTRE
-        self._rays = camera.backproject(coarse, np.ones(len(coarse)))
-        self._blocks = _maps(camera.distort(coarse), self._shape)  # where each coarse pixel is measured, px
+        self._rays = camera.backproject(coarse, np.ones(len(coarse))).T.astype(np.float32)
+        to_coarse = np.diag([1 / _STEP, 1 / _STEP, 1.0])
+        to_coarse[:2, 2] = -_CENTRE / _STEP
+        self._matrix = to_coarse @ camera.matrix()
+        where = np.rint(camera.distort(coarse)).astype(np.int64).T
+        self._column, self._row = (
+            np.clip(p, 0, n - 1) for p, n in zip(where, (camera.width, camera.height), strict=True)
+        )
         self._measured = _maps((camera.distort(coarse) - _CENTRE) / _STEP, self._shape)
         whole = (camera.height, camera.width)
-        self._flat = _maps((camera.undistort(_grid(*whole)) - _CENTRE) / _STEP, whole)
+        flat = _maps((camera.undistort(_grid(*whole)) - _CENTRE) / _STEP, whole)
+        self._flat = cv2.convertMaps(*flat, cv2.CV_16SC2)
 
     def nearest(self, depth: NDArray[np.float32]) -> Coarse:
         """What a keyframe remembers of its depth image [H, W] m: the least around every coarse pixel."""
         return np.asarray(cv2.erode(self._coarse(depth), np.ones((3, 3), np.uint8)), dtype=np.float32)
 
-    def movers(self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]) -> NDArray[np.bool_]:
-        """depth: [H, W] m, 0 = none; T_cw: the frame's expected pose. Returns [H, W] bool, True = moves."""
+    def compare(self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]) -> Comparison:
+        """depth: [H, W] m, 0 = none; T_cw: [4, 4] the frame's expected pose."""
         image = self._coarse(depth)
-        through, agrees = self._votes(image, T_cw, references)
-        found = _whole(through >= min(_VOTES, max(len(references) - 1, 1)), (agrees > 0) & (through == 0), image)
-        if not found.any() or np.count_nonzero(found) > _MOST * np.count_nonzero(image):
-            return np.zeros(depth.shape, dtype=np.bool_)
-        return np.asarray(cv2.remap(found.astype(np.float32), *self._flat, cv2.INTER_LINEAR) > 0.5)
+        rows = np.flatnonzero(image)
+        shape = (len(references), *self._shape)
+        through, agrees = (np.zeros((shape[0], image.size), dtype=np.bool_) for _ in range(2))
+        if references and len(rows):
+            seen, z = self._looked_up(self._rays[:, rows] * image.ravel()[rows], inverse(T_cw), references)
+            tolerance = _NEARER + _NEARER_PER_M * z
+            through[:, rows] = (seen - z > tolerance) & (z > _NEAR)
+            agrees[:, rows] = (seen > 0) & (np.abs(seen - z) <= tolerance) & (z > _NEAR)
+        return Comparison(image, through.reshape(shape), agrees.reshape(shape))
 
-    def at_rest(
-        self, mask: NDArray[np.bool_], depth: NDArray[np.float32], T_cw: Array, references: list[Reference]
-    ) -> NDArray[np.bool_]:
+    def movers(self, comparison: Comparison) -> NDArray[np.bool_]:
+        """Returns [H, W] bool, True = moves."""
+        image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
+        found = _whole(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
+        if not found.any() or np.count_nonzero(found) > _MOST * np.count_nonzero(image):
+            return np.zeros((self.camera.height, self.camera.width), dtype=np.bool_)
+        return np.asarray(cv2.remap(found.astype(np.uint8) * 255, *self._flat, cv2.INTER_LINEAR) > 127)
+
+    def at_rest(self, mask: NDArray[np.bool_], comparison: Comparison) -> NDArray[np.bool_]:
         """The connected parts of a mask [H, W] that lie where every reference that could see them saw a surface.
 
         Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told from rest.
         """
-        image = self._coarse(depth)
-        through, agrees = self._votes(image, T_cw, references)
-        _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-        coarse = cv2.remap(parts.astype(np.float32), *self._blocks, cv2.INTER_NEAREST).astype(np.int64)
-        count = int(parts.max()) + 1
+        count, parts = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
+        coarse = np.asarray(parts[self._row, self._column]).reshape(self._shape)
         readings, still, moved = (
             np.bincount(coarse[chosen], minlength=count)
-            for chosen in (image > 0, (agrees > 0) & (through == 0), through > 0)
+            for chosen in (comparison.image > 0, comparison.still, comparison.through.any(axis=0))
         )
         rests = (still >= np.maximum(_JUDGED * readings, _LEAST)) & (moved <= _MOVED * still)
         rests[0] = False
-        return np.asarray(rests[parts])
+        return np.asarray(rests[parts]) if rests.any() else np.zeros_like(mask)
 
     def _coarse(self, depth: NDArray[np.float32]) -> Coarse:
         """The least reading of every block, 0 where less than half of it has one."""
         h, w = self._shape
-        blocks = depth[: h * _STEP, : w * _STEP].reshape(h, _STEP, w, _STEP)
-        known = np.count_nonzero(blocks, axis=(1, 3)) >= _STEP * _STEP // 2
-        least = np.where(blocks > 0, blocks, np.float32(np.inf)).min(axis=(1, 3))
-        image = np.where(known & (least < _FAR), least, 0.0).astype(np.float32)
+        depth = depth[: h * _STEP, : w * _STEP]
+        known = depth > 0
+        least = np.where(known, depth, np.float32(np.inf)).reshape(h, _STEP, w * _STEP).min(axis=1)
+        least = np.ascontiguousarray(least.reshape(h, w, _STEP).transpose(2, 0, 1)).min(axis=0)
+        share = cv2.resize(known.view(np.uint8) * np.uint8(128), (w, h), interpolation=cv2.INTER_AREA)
+        image = np.where((share >= 64) & (least < _FAR), least, 0.0).astype(np.float32)
         return np.asarray(cv2.remap(image, *self._measured, cv2.INTER_NEAREST), dtype=np.float32)
 
-    def _votes(
-        self, image: Coarse, T_cw: Array, references: list[Reference]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """How many references looked through each coarse pixel's place, and how many saw a surface there: [h, w]."""
+    def _looked_up(
+        self, points: NDArray[np.float32], T_wc: Array, references: list[Reference]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """points: [3, n] in the frame T_wc, m. Returns [k, n] m: the depth each reference has there, and that of the
+        points from it. float32: that is a hundredth of a coarse pixel, and half the time."""
         h, w = self._shape
-        rows = np.flatnonzero(image)
-        world = to_local(inverse(T_cw), self._rays[rows] * image.ravel()[rows, None])
-        through, agrees = (np.zeros(h * w, dtype=np.int64) for _ in range(2))
-        for reference in references:
-            local = to_local(reference.T_cw, world)
-            depth = local[:, 2]
-            ahead = depth > _NEAR
-            places = self.camera.project(np.where(ahead[:, None], local, 1.0))
-            x, y = np.rint((places - _CENTRE) / _STEP).astype(np.int64).T
-            inside = ahead & (x >= 0) & (y >= 0) & (x < w) & (y < h)
-            seen = np.where(inside, reference.nearest[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)], 0.0)
-            tolerance = _NEARER + _NEARER_PER_M * depth
-            through[rows] += seen - depth > tolerance
-            agrees[rows] += (seen > 0) & (np.abs(seen - depth) <= tolerance)
-        return through.reshape(h, w), agrees.reshape(h, w)
+        T = np.stack([reference.T_cw for reference in references]) @ T_wc
+        bent = np.concatenate([self._matrix @ T[:, :3, :3], self._matrix @ T[:, :3, 3:]], axis=2).astype(np.float32)
+        local = (bent[:, :, :3].reshape(-1, 3) @ points).reshape(len(references), 3, -1) + bent[:, :, 3:]
+        z = local[:, 2]
+        places = local[:, :2] / np.maximum(z, np.float32(_NEAR))[:, None] + np.float32(1.5)  # of the image with a rim
+        x, y = (np.clip(places[:, axis], 0, size + 1).astype(np.int32) for axis, size in ((0, w), (1, h)))
+        rimmed = np.zeros((len(references), h + 2, w + 2), dtype=np.float32)
+        for image, reference in zip(rimmed, references, strict=True):
+            image[1:-1, 1:-1] = reference.nearest
+        first = np.arange(len(references), dtype=np.int32)[:, None] * ((h + 2) * (w + 2))
+        return rimmed.ravel().take(first + y * (w + 2) + x), z
 
 
 def _grid(height: int, width: int) -> Array:

@@ -160,17 +160,19 @@ class Map:
     def project(self, ids: NDArray[np.int64], T_cw: Array) -> Projected:
         """The points among `ids` that a camera at T_cw should see."""
         camera, local = self.camera, to_local(T_cw, self.positions[ids])
-        ids, local = ids[local[:, 2] > _NEAR], local[local[:, 2] > _NEAR]
-        pixels = camera.project(local)
-        distance = np.linalg.norm(local, axis=1)
-        towards = local @ T_cw[:3, :3]
+        z = np.maximum(local[:, 2], _NEAR)
+        u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
+        inside = (local[:, 2] > _NEAR) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        ids, local = ids[inside], local[inside]
+        distance = np.sqrt(np.einsum("nj,nj->n", local, local))
         sums = self.directions[ids]
-        cosine = (towards * sums).sum(axis=1) / (distance * np.linalg.norm(sums, axis=1) + 1e-12)
+        along = np.einsum("nj,nj->n", local @ T_cw[:3, :3], sums)  # cosine times distance times length of the sum
         level = np.log(np.maximum(self.reach[ids], 1e-9) / distance) / np.log(SCALE)
-        inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-        inside &= (cosine > _VIEW_COSINE) & (level > -1.0) & (level < LEVELS)
-        levels = np.clip(np.rint(level[inside]), 0, LEVELS - 1).astype(np.int64)
-        return Projected(ids[inside], pixels[inside], levels, self.descriptors[ids[inside]])
+        seen = along > _VIEW_COSINE * distance * np.sqrt(np.einsum("nj,nj->n", sums, sums))
+        seen &= (level > -1.0) & (level < LEVELS)
+        levels = np.clip(np.rint(level[seen]), 0, LEVELS - 1).astype(np.int64)
+        pixels = np.stack([u[inside][seen], v[inside][seen]], axis=1)
+        return Projected(ids[seen], pixels, levels, self.descriptors[ids[seen]])
 
     def _add_observer(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
         self.observers[ids, self.seen_by[ids] % _OBSERVERS] = keyframe.index + 1

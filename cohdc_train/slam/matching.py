@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cohdc_train.slam.features import Features, hamming
 
@@ -51,18 +50,40 @@ def match_projected(
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     reach = radius * np.minimum(features.sigmas, _WIDEST)
-    trees = [
-        cKDTree(points, compact_nodes=False, balanced_tree=False) for points in (projected.pixels, features.points)
-    ]
-    pairs = trees[0].sparse_distance_matrix(trees[1], float(reach.max()), output_type="ndarray")
-    i, j = pairs["i"].astype(np.int64), pairs["j"].astype(np.int64)
-    near = pairs["v"] <= reach[j]
-    near &= np.abs(features.octaves[j] - projected.levels[i]) <= 1
+    i, j = _neighbours(projected.pixels, features.points, float(reach.max()))
+    near = np.abs(features.octaves[j] - projected.levels[i]) <= 1
+    i, j = i[near], j[near]
+    offset = projected.pixels[i] - features.points[j]
+    near = np.einsum("kc,kc->k", offset, offset) <= reach[j] ** 2
     i, j = i[near], j[near]
     bits = hamming(projected.descriptors[i], features.descriptors[j])
     keep = bits <= max_distance
     i, j = one_to_one(i[keep], j[keep], bits[keep], ratio)
     return Matches(projected.ids[i], j)
+
+
+def _neighbours(
+    first: NDArray[np.float64], second: NDArray[np.float64], reach: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """first: [m, 2]; second: [n, 2] px. Returns pairs (i, j) [k] each: all that lie within reach, and some that do not.
+
+    The points of `second` are sorted into square cells of that size; the three cells of a row beside each other that
+    a point of `first` looks at are then one piece of the sorted list.
+    """
+    corner = second.min(axis=0) - reach
+    cells = ((second - corner) / reach).astype(np.int64)  # from 1 on: there is a rim of empty cells
+    width, height = (cells.max(axis=0) + 2).tolist()
+    key = cells[:, 1] * width + cells[:, 0]
+    order = np.argsort(key, kind="stable")
+    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=width * height))]
+    places = np.floor((first - corner) / reach).astype(np.int64)
+    x, y = np.clip(places, 0, (width - 1, height - 1)).T
+    rows = np.clip(y + np.array([[-1], [0], [1]]), 0, height - 1) * width  # a row at the border, twice, is empty
+    low = begins[rows + np.maximum(x - 1, 0)]
+    count = (begins[rows + np.minimum(x + 2, width)] - low).ravel()
+    starts = low.ravel() - np.cumsum(count) + count
+    j = order[np.repeat(starts, count) + np.arange(count.sum())]
+    return np.repeat(np.tile(np.arange(len(first)), 3), count), j
 
 
 def one_to_one(

@@ -7,6 +7,7 @@ see, so that depth too is weighed in px. Rows of depth that were not measured we
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -103,7 +104,7 @@ def residuals(local: Array, seen: Observations, weighing: Weighing) -> Array:
     """local: [m, 3] points in the camera frame, m. Returns [m, 3] prediction minus measurement, in sigmas."""
     camera = weighing.camera
     z = np.maximum(local[:, 2], _NEAR)
-    result = np.empty((len(local), 3))
+    result = np.empty((3, len(local))).T  # each residual's values side by side
     result[:, 0] = camera.fx * local[:, 0] / z + camera.cx - seen.pixels[:, 0]
     result[:, 1] = camera.fy * local[:, 1] / z + camera.cy - seen.pixels[:, 1]
     disparity = weighing.bf / z - weighing.bf / seen.depths
@@ -174,20 +175,39 @@ def optimize_pose(
 
 def _refine(T_cw: Array, points: Array, seen: Observations, weighing: Weighing, steps: int = 8) -> Array:
     limits = seen.limits
+    J = np.zeros((6, 3, len(points)))
     for _ in range(steps):
         local = to_local(T_cw, points)
-        error = residuals(local, seen, weighing)
-        weight = huber_weights(np.einsum("ij,ij->i", error, error), limits)
+        error = residuals(local, seen, weighing).T
+        weight = huber_weights(np.einsum("im,im->m", error, error), limits)
         weight[local[:, 2] <= _NEAR] = 0.0
-        J = pose_jacobian(local, residual_jacobian(local, seen, weighing)).reshape(-1, 6)
-        weighted = J * np.repeat(weight, 3)[:, None]
-        step = np.asarray(
-            np.linalg.solve(J.T @ weighted + 1e-9 * np.eye(6), -np.einsum("ma,m->a", weighted, error.reshape(-1)))
-        )
-        T_cw = exp_se3(step) @ T_cw
+        _fill_pose_jacobian(J, local, seen, weighing)
+        rows, weighted = J.reshape(6, -1), (J * weight).reshape(6, -1)
+        step = np.linalg.solve(weighted @ rows.T + 1e-9 * np.eye(6), -(weighted @ error.reshape(-1)))
+        turn = np.asarray(cv2.Rodrigues(step[3:])[0])
+        T_cw = T_cw.copy()
+        T_cw[:3] = turn @ T_cw[:3]
+        T_cw[:3, 3] += step[:3]  # exp(xi) to first order, which is all that the last, tiny step needs
         if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
             break
     # A pose is predicted from the two before, which doubles what rounding took from its rotation; one Newton step back.
     R = T_cw[:3, :3]
     T_cw[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)
     return T_cw
+
+
+def _fill_pose_jacobian(J: Array, local: Array, seen: Observations, weighing: Weighing) -> None:
+    """J: [6, 3, m], zero at first: pose_jacobian of residual_jacobian, laid out for speed with its zeros left out."""
+    camera = weighing.camera
+    x, y = np.ascontiguousarray(local[:, :2].T)
+    z = np.maximum(local[:, 2], _NEAR)
+    u, v = J[:, 0], J[:, 1]
+    J[0, 0] = camera.fx / (z * seen.sigmas)
+    J[1, 1] = camera.fy / (z * seen.sigmas)
+    J[2, 0], J[2, 1] = -u[0] * x / z, -v[1] * y / z
+    J[2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf / (z * z * seen.sigmas))
+    J[3] = y * J[2]  # a turn moves the point by phi x local
+    J[3, 1] -= z * v[1]
+    J[4] = -x * J[2]
+    J[4, 0] += z * u[0]
+    J[5, 0], J[5, 1] = -y * u[0], x * v[1]

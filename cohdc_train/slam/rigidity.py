@@ -68,17 +68,27 @@ def moving_group(T_cw: Array, points: Array, seen: Observations, weighing: Weigh
     J = pose_jacobian(local, residual_jacobian(local, seen, weighing))
     steps, covariances = _poses_without(groups, J, error, seen.limits)
     best, score = nothing, 0.0
-    for group, step, covariance in zip(groups, steps, covariances, strict=True):
+    for row in np.flatnonzero(_may_move(groups, J, error, steps)):
+        group = groups[row]
         by_pose = J[group]
-        off = error[group] + by_pose @ step
-        if np.median(np.einsum("mi,mi->m", off, off)) <= _LIMIT:  # the pose's uncertainty only makes less of it
-            continue
-        spread = np.eye(3) + by_pose @ covariance @ by_pose.transpose(0, 2, 1)
+        off = error[group] + by_pose @ steps[row]
+        spread = np.eye(3) + by_pose @ covariances[row] @ by_pose.transpose(0, 2, 1)
         squares = np.einsum("mi,mi->m", off, np.linalg.solve(spread, off[..., None])[..., 0])
         excess = float(np.median(squares)) / _LIMIT
         if excess > 1 and len(off) * min(excess, _CLEARLY) > score:
             best, score = group, len(off) * min(excess, _CLEARLY)
     return best
+
+
+def _may_move(groups: NDArray[np.bool_], J: Array, error: Array, steps: Array) -> NDArray[np.bool_]:
+    """[g] False where over half of a group lies within the limit even of a pose that is certain.
+
+    The pose's own uncertainty only makes less of a distance, so the exact test is spared.
+    """
+    off = error[..., None] + (J.reshape(-1, 6) @ steps.T).reshape(*error.shape, -1)
+    squares = off[:, 0] ** 2 + off[:, 1] ** 2 + off[:, 2] ** 2
+    within = np.count_nonzero((squares <= _LIMIT) & groups.T, axis=0)
+    return np.asarray(2 * within <= groups.sum(axis=1))
 
 
 def _poses_without(groups: NDArray[np.bool_], J: Array, error: Array, limits: Array) -> tuple[Array, Array]:

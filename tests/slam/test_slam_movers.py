@@ -39,7 +39,7 @@ def with_box(image: Depth, left: int, depth: float) -> Depth:
 
 def found(camera: Camera, now: Depth, before: list[Depth], T_cw: Array = STILL) -> NDArray[np.bool_]:
     geometry = Geometry(camera)
-    return geometry.movers(now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before])
+    return geometry.movers(geometry.compare(now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before]))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
@@ -79,9 +79,10 @@ def test_a_masked_thing_that_has_stood_still_is_told_from_one_that_came() -> Non
     before, geometry = with_box(wall(), 30, 1.5), Geometry(CAMERA)
     now = with_box(before, 200, 1.5)
     references = [Reference(STILL, geometry.nearest(before))] * 3
-    rests = geometry.at_rest(boxes(30, 200), now, STILL, references)
+    rests = geometry.at_rest(boxes(30, 200), geometry.compare(now, STILL, references))
     np.testing.assert_array_equal(rests, boxes(30))
-    assert not geometry.at_rest(boxes(30, 200), np.zeros_like(now), STILL, references).any(), "no depth, no verdict"
+    blind = geometry.compare(np.zeros_like(now), STILL, references)
+    assert not geometry.at_rest(boxes(30, 200), blind).any(), "no depth, no verdict"
 
 
 def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
@@ -111,7 +112,7 @@ def test_the_camera_may_move() -> None:
     first, second = (render(room(), path[k])[1] for k in (0, 15))
     geometry = Geometry(CAMERA)
     references = [Reference(np.linalg.inv(path[0]), geometry.nearest(first))] * 2
-    assert not geometry.movers(second, np.linalg.inv(path[15]), references).any()
+    assert not geometry.movers(geometry.compare(second, np.linalg.inv(path[15]), references)).any()
 
 
 @given(st.floats(0, 319), st.floats(0, 239))
