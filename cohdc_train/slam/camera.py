@@ -22,6 +22,7 @@ class Camera:
     """Intrinsics in px; a stored depth value divided by `depth_scale` is metres along the optical axis.
 
     baseline: m from the left camera of a rectified stereo pair to the right one; 0 for a camera that measures depth.
+    readout: s from the colour image's first row to its last; 0 for a camera that takes all rows at once.
     """
 
     fx: float
@@ -37,6 +38,7 @@ class Camera:
     p2: float = 0.0
     k3: float = 0.0
     baseline: float = 0.0
+    readout: float = 0.0
 
     @property
     def far(self) -> float:
@@ -84,7 +86,7 @@ class Camera:
 
 
 def load_camera(path: Path) -> Camera:
-    """Read `fx fy cx cy width height depth_scale` and, 0 where absent, `k1 k2 p1 p2 k3` and `baseline`.
+    """Read `fx fy cx cy width height depth_scale` and, 0 where absent, `k1 k2 p1 p2 k3`, `baseline`, `readout`.
 
     A camera with a baseline needs no depth_scale.
 
@@ -98,8 +100,8 @@ def load_camera(path: Path) -> Camera:
             raise DataError(f"{path}:{line}: unknown key {key!r}; a camera has {' '.join(sorted(known))}")
         if key in _REQUIRED and key not in ("cx", "cy") and value <= 0:
             raise DataError(f"{path}:{line}: {key} must be above 0, not {value:g}")
-        if key == "baseline" and value < 0:
-            raise DataError(f"{path}:{line}: baseline is a distance and cannot be {value:g}")
+        if key in ("baseline", "readout") and value < 0:
+            raise DataError(f"{path}:{line}: {key} cannot be below 0, and is {value:g}")
         values[key] = value
     if values.get("baseline"):
         values.setdefault("depth_scale", 1.0)

@@ -22,6 +22,7 @@ from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse, log_se3
 from cohdc_train.slam.refinement import Pyramid, Refiner
+from cohdc_train.slam.shutter import unrolled
 
 _MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
@@ -97,7 +98,11 @@ class Tracker:
         start = time.perf_counter()
         self._take_in_mapping()
         mask = self.mask = self._dynamic(mask, depth_m, t)
-        features = self._extract(rgb, depth_m, mask, self._lag(t, depth_t))
+        twist = self._twist()
+        lag = None if twist is None or depth_t is None else exp_se3(twist * (depth_t - t))
+        features = self._extract(rgb, depth_m, mask, lag)
+        if twist is not None:
+            features = unrolled(features, self.camera, twist)
         fit = self._locate(features, rgb)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
@@ -144,14 +149,12 @@ class Tracker:
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
         return dynamic_mask_of(self._geometry, mask, depth_m, self._velocity @ self._last.T_cw, around, t)
 
-    def _lag(self, t: float, depth_t: float | None) -> Array | None:
-        """[4, 4] from the camera's frame at t to that at depth_t, by the velocity between the last two frames."""
-        if depth_t is None or self._last is None or len(self._log) < 2:
+    def _twist(self) -> Array | None:
+        """[6] velocity between the last two frames, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t)."""
+        if self._last is None or len(self._log) < 2:
             return None
         step = self._log[-1][0] - self._log[-2][0]
-        if not 0 < step <= _LONGEST:
-            return None
-        return exp_se3(log_se3(self._velocity) * ((depth_t - t) / step))
+        return log_se3(self._velocity) / step if 0 < step <= _LONGEST else None
 
     def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
         if not self.map.keyframes:

@@ -1,0 +1,51 @@
+"""Corners of a rolling shutter, put where all rows at once would have seen them."""
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from plane_world import CAMERA
+
+from cohdc_train.slam.features import Features
+from cohdc_train.slam.optimization import Array, exp_se3, to_local
+from cohdc_train.slam.shutter import unrolled
+
+ROLLING = replace(CAMERA, readout=0.02)
+speeds = st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6)
+
+
+def seen(points: Array, twist: Array) -> Features:
+    """What a rolling shutter measures: every point at the moment at which its own row is read."""
+    late = np.zeros(len(points))
+    for _ in range(20):  # the row depends on the moment, and the moment on the row
+        local = np.concatenate(
+            [to_local(exp_se3(twist * t), point[None]) for t, point in zip(late, points, strict=True)]
+        )
+        pixels = CAMERA.project(local)
+        late = ROLLING.readout * (pixels[:, 1] / CAMERA.height - 0.5)
+    none = np.zeros(len(points), dtype=np.int64)
+    return Features(pixels, pixels, none, np.zeros((len(points), 4), dtype=np.uint64), local[:, 2])
+
+
+@given(speeds)
+def test_corners_are_where_the_middle_row_s_moment_has_them(speed: list[float]) -> None:
+    points = np.random.default_rng(0).uniform([-0.8, -0.6, 1.5], [0.8, 0.6, 3.0], (30, 3))
+    twist = np.array(speed)
+    measured = seen(points, twist)
+    result = unrolled(measured, ROLLING, twist)
+    np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.03)
+    np.testing.assert_allclose(result.depths, points[:, 2], atol=3e-4)
+    np.testing.assert_array_equal(unrolled(measured, CAMERA, twist).points, measured.points)
+
+
+def test_a_corner_without_depth_moves_like_the_others() -> None:
+    points = np.random.default_rng(1).uniform([-0.8, -0.6, 1.9], [0.8, 0.6, 2.1], (30, 3))
+    twist = np.array([0.5, 0.3, 0.0, 0.1, 0.6, 0.2])
+    measured = seen(points, twist)
+    blind = replace(measured, depths=np.where(np.arange(30) % 3 == 0, np.nan, measured.depths))
+    result = unrolled(blind, ROLLING, twist)
+    assert np.isnan(result.depths).sum() == 10
+    np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.1)
+    nothing = replace(measured, depths=np.full(30, np.nan))
+    np.testing.assert_array_equal(unrolled(nothing, ROLLING, twist).points, measured.points)
