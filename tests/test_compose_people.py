@@ -69,7 +69,7 @@ def test_what_is_nearer_hides_a_person_and_the_rest_stays_as_it_was(tool: Module
     depth[:, :20] = 0
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     cv2.imwrite(str(tmp_path / "c.png"), np.full((120, 160, 3), 120, np.uint8))
-    frame = Frame(0.0, "0", tmp_path / "c.png", tmp_path / "d.png")
+    frame = Frame(0.0, "0", "0", tmp_path / "c.png", tmp_path / "d.png")
     layers = [tool.seen(*standing(tool, 2.0), 0.0, LEVEL, tool.rays(CAMERA, 1))]
     rgb, units, mask = tool.compose(frame, CAMERA, layers, np.random.default_rng(0))
     assert mask[:58].any()

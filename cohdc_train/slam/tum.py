@@ -16,10 +16,11 @@ from cohdc_train.trajectory import associate
 
 @dataclass(frozen=True)
 class Frame:
-    """One associated pair; `t` is the colour image's stamp, s."""
+    """One associated pair; `t` and `stamp` are the colour image's, s; `depth_stamp` is the depth image's own."""
 
     t: float
     stamp: str
+    depth_stamp: str
     rgb: Path
     depth: Path
 
@@ -55,7 +56,7 @@ def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
     image that is not there, or when nothing pairs.
     """
     pairs, alone = read_pairs(folder / "rgb.txt", folder / "depth.txt", max_difference)
-    frames = tuple(Frame(rgb.t, rgb.stamp, rgb.image, depth.image) for rgb, depth in pairs)
+    frames = tuple(Frame(rgb.t, rgb.stamp, depth.stamp, rgb.image, depth.image) for rgb, depth in pairs)
     return Sequence(folder, frames, alone)
 
 
