@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,11 +113,11 @@ def check_out(out: Path) -> None:
         raise DataError(f"{out}: is a file; --out names a folder")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+        for folder in (out.parent, out):
+            if folder.exists():
+                tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise DataError(f"{out}: cannot be written: {error.strerror}") from error
-    for folder in (out.parent, out):
-        if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
-            raise DataError(f"{out}: cannot be written: no permission in {folder}")
 
 
 def draw_before(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
