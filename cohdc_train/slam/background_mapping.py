@@ -7,6 +7,7 @@ is under way at a time; a keyframe that joins meanwhile waits, and a newer one t
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -60,7 +61,7 @@ class BackgroundMapper:
 
 @contextmanager
 def worker_process() -> Iterator[Executor]:
-    """One process, ready to work, that gives way to its parent."""
+    """One process, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as executor:
         executor.submit(_give_way).result()
@@ -68,5 +69,6 @@ def worker_process() -> Iterator[Executor]:
 
 
 def _give_way() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
     if hasattr(os, "nice"):
         os.nice(_NICE)

@@ -49,7 +49,8 @@ class Live(LiveSource):
     """A camera of one's own: anything that gives (rgb, depth_m, t) one after the other, or None while nothing comes.
 
     rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, registered to the colour image, 0 or nan = no
-    reading; t: s, rising. Raises DataError for a frame of another shape or a time that does not rise.
+    reading; t: s, rising. Both images are copied: a camera may use its buffers again. Raises DataError for a frame of
+    another shape or a time that does not rise.
     """
 
     def __init__(self, camera: Camera, frames: Iterable[Frame | None]) -> None:
@@ -71,7 +72,7 @@ class Live(LiveSource):
             if not t > last:
                 raise DataError(f"live frame at {t:.6f} s does not come after {last:.6f} s")
             last, stamp = t, f"{t:.6f}"
-            yield View(t, stamp, stamp, rgb, np.nan_to_num(depth_m, nan=0.0, posinf=0.0).astype(np.float32))
+            yield View(t, stamp, stamp, rgb.copy(), np.nan_to_num(depth_m, nan=0.0, posinf=0.0).astype(np.float32))
 
 
 class Followed(LiveSource):
@@ -79,11 +80,14 @@ class Followed(LiveSource):
 
     Ends with a file `done` in it or after `idle` s without a new line, when every listed pair has been given; at once
     when stopped. Pairs are chosen in the order of time, nearest first. A line or image that cannot be used is told on
-    stderr and left out, but for the first, whose DataError is raised.
+    stderr and left out, but for the first, whose DataError is raised, as it is when no frame comes.
     """
 
     def __init__(self, folder: Path, camera: Camera, layout: Layout, idle: float) -> None:
         super().__init__(camera)
+        if not idle > 0:
+            raise DataError(f"idle is {idle:g}; it must be above 0 s")
+        self._folder = folder
         self._done = folder / "done"
         self._lists = [_GrowingList(folder / name) for name in (layout.first, layout.second)]
         self._layout = layout
@@ -102,6 +106,8 @@ class Followed(LiveSource):
                 continue
             given += 1
             yield view
+        if given == 0 and not self._stopped.is_set():
+            raise DataError(f"{self._folder}: no frame came in {self._idle:g} s; nothing is written")
 
     def _pairs(self) -> Iterator[tuple[Entry, Entry]]:
         """Pairs as soon as their partner is certain: when the second list has come as far as the entry."""

@@ -88,13 +88,14 @@ class Localizer:
         projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
         matches = match_projected(projected, features, radius=5.0)
         points, seen = self._seen(features, matches)
+        moving = np.zeros(len(matches), dtype=np.bool_)
         if self._judges:
             T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing)
-            self.map.judge(matches.points[inlier], matches.points[moving])
         else:
             T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
         if inlier.sum() < minimum:
             return None
+        self.map.judge(matches.points[inlier], matches.points[moving])
         matches = matches.take(inlier)
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1

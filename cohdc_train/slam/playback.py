@@ -45,7 +45,7 @@ def play(
             mask, record = _step(tracker, view, mask_of)
             records.append(record)
             if index in chosen and tracker.features is not None:
-                drawn.append(_Picture(view, mask, tracker.features))
+                drawn.append(_Picture(view, tracker.mask, tracker.features))
             for watcher in watchers:
                 watcher(view, mask, record, tracker)
             _progress(index + 1, count, record)
@@ -53,6 +53,9 @@ def play(
         if not records or count:
             raise
         print(f"ended: {error}", file=sys.stderr)  # what a live run has so far is not lost
+    finally:
+        if records and sys.stderr.isatty():
+            print(file=sys.stderr)  # ends the line of progress
     if not records:
         raise DataError("no frame came: nothing is written")
     tracker.finish()
@@ -70,13 +73,15 @@ def _pictured(count: int) -> set[int]:
 
 
 def _step(tracker: Tracker, view: View, mask_of: MaskSource) -> tuple[NDArray[np.bool_] | None, FrameRecord]:
-    """One frame: its mask, with what geometry found, and what became of it."""
+    """One frame: what a watcher gets as its mask, and what became of it."""
     start = time.perf_counter()
     mask = mask_of(view)
     segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
     pose = tracker.track(view.rgb, view.depth, view.t, mask, view.depth_t)
     culled = 0.0 if tracker.mask is None else float(tracker.mask.mean())
-    return tracker.mask, FrameRecord(view.stamp, pose, culled, segment_ms, view.depth_ms)
+    # Who is at rest is of use to tracking, but belongs into no cloud.
+    mask = tracker.mask if mask is None or tracker.mask is None else mask | tracker.mask
+    return mask, FrameRecord(view.stamp, pose, culled, segment_ms, view.depth_ms)
 
 
 def _draw(picture: _Picture, extract: FeatureExtractor, folder: Path) -> None:
@@ -92,6 +97,6 @@ def _progress(done: int, count: int, record: FrameRecord) -> None:
     state = f"{record.pose.inliers} inliers" if record.pose.tracked else "lost"
     line = f"frame {done}/{count}  {state}" if count else f"frame {done}  {state}"
     if sys.stderr.isatty():
-        print(f"\r{line:<50}", end="\n" if done == count else "", file=sys.stderr, flush=True)
+        print(f"\r{line:<50}", end="", file=sys.stderr, flush=True)
     elif done % 100 == 0 if count == 0 else done * 10 // count > (done - 1) * 10 // count:
         print(line, file=sys.stderr, flush=True)

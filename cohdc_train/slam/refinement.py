@@ -92,7 +92,10 @@ class Refiner:
         rows = corners[good]
         pixels, points = features.pixels.copy(), features.points.copy()
         pixels[rows] += shift[good] * SCALE ** octaves[good, None]
-        points[rows] = self.world.camera.undistort(pixels[rows])
+        undistort = self.world.camera.undistort
+        points[rows] += undistort(pixels[rows]) - undistort(
+            features.pixels[rows]
+        )  # they may be unrolled, see `shutter`
         return replace(features, pixels=pixels, points=points)
 
 

@@ -4,6 +4,8 @@ import csv
 import json
 import os
 import shutil
+import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,9 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.slam.features import Features
 from cohdc_train.slam.tracking import Pose
-from cohdc_train.trajectory import Trajectory, read_tum, score, write_tum
+from cohdc_train.trajectory import Trajectory, score, write_tum
 
+_NOT_ALWAYS = ("cloud.ply", "map.png")  # files of a run that not every run writes
 _GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
 
 
@@ -34,14 +37,14 @@ class FrameRecord:
 
 
 def measure(
-    records: list[FrameRecord], trajectory: Trajectory, groundtruth: Path | None, dropped: int = 0
+    records: list[FrameRecord], trajectory: Trajectory, truth: Trajectory | None, dropped: int = 0
 ) -> dict[str, Any]:
     """The numbers of metrics.json but the seed.
 
     dropped: frames that came while the tracker was busy and have no record; they count as frames without a pose.
     `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map` over keyframes only, `depth` of
-    stereo pairs only; `fps` is frames over the time of all stages. Raises DataError when the ground truth's file is
-    broken.
+    stereo pairs only; `fps` is frames over the time of all stages. Errors are absent without a truth, and, which is
+    told on stderr, where it is of another time.
     """
     poses = [record.pose for record in records]
     depth = [record.depth_ms for record in records]
@@ -60,8 +63,11 @@ def measure(
         "fps": 1e3 * len(poses) / busy,
         "ms": {stage: quantiles(row) for stage, row in times.items()},
     }
-    if groundtruth is not None and tracked >= 3:
-        result.update(score(read_tum(groundtruth), trajectory))
+    if truth is not None and tracked >= 3:
+        try:
+            result.update(score(truth, trajectory))
+        except DataError as error:
+            print(f"no scores: {error}", file=sys.stderr)
     return result
 
 
@@ -89,8 +95,11 @@ def write_run(
 
 
 def publish(part: Path, out: Path) -> None:
-    """Move everything in `part` into `out` by renaming; what a former run left under the same names goes."""
+    """Move everything in `part` into `out` by renaming; what a former run left under the same names goes, and its maps
+    where this one made none."""
     out.mkdir(parents=True, exist_ok=True)
+    for name in _NOT_ALWAYS:
+        (out / name).unlink(missing_ok=True)
     for item in sorted(part.iterdir()):
         target = out / item.name
         if target.is_dir():
@@ -99,10 +108,16 @@ def publish(part: Path, out: Path) -> None:
 
 
 def check_out(out: Path) -> None:
-    """Raise DataError when `out` cannot become a folder of results."""
+    """Raise DataError when `out` cannot become a folder of results. Makes the folder above it."""
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: is a file; --out names a folder")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        for folder in (out.parent, out):
+            if folder.exists():
+                tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise DataError(f"{out}: cannot be written: {error.strerror}") from error
 
 
 def draw_before(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:

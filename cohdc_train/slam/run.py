@@ -21,10 +21,10 @@ from cohdc_train.slam.realtime import workers
 from cohdc_train.slam.results import check_out, measure, publish, write_run
 from cohdc_train.slam.source import Recorded, Source, rgbd_layout
 from cohdc_train.slam.stereo import stereo_layout
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.tracking import MIN_START, Tracker
 from cohdc_train.slam.viewer import Viewer
 from cohdc_train.slam.watching import Watcher
-from cohdc_train.trajectory import Trajectory
+from cohdc_train.trajectory import Trajectory, read_tum
 
 
 def slam(
@@ -70,7 +70,7 @@ def slam(
         view: show the run in rerun's window while it goes; needs `pip install 'cohdc-train[view]'`.
         rrd: file to record the same for rerun, to be looked at later.
     """
-    _check_options(out, model, masks)
+    _check_options(out, model, masks, seed, features)
     source, origin = _source(sequence, camera, follow, idle)
     return run_source(
         source,
@@ -111,8 +111,9 @@ def run_source(
     watchers: called after every frame; origin: words about the source for config.yaml. Raises DataError when no frame
     comes.
     """
-    _check_options(out, model, masks)
+    _check_options(out, model, masks, seed, features)
     culling, method = culling or Culling(), method or Method()
+    truth = None if source.groundtruth is None else read_tum(source.groundtruth)
     maker = _masks(model, masks, source.camera, culling, 1 if realtime else 0)
     options = {"model": model, "masks": masks, "seed": seed, "features": features, "realtime": realtime}
     config: dict[str, Any] = {key: str(v) if isinstance(v, Path) else v for key, v in options.items()}
@@ -133,7 +134,7 @@ def run_source(
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops, "without_depth": source.without_depth}
-        metrics |= measure(records, trajectory, source.groundtruth, beside.source.dropped if beside else 0)
+        metrics |= measure(records, trajectory, truth, beside.source.dropped if beside else 0)
         metrics |= beside.metrics() if beside else {}
         write_run(part, records, trajectory, metrics, config)
         publish(part, out)
@@ -161,9 +162,13 @@ def summary(metrics: dict[str, Any]) -> str:
     return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
-def _check_options(out: Path, model: Path | None, masks: Path | None) -> None:
+def _check_options(out: Path, model: Path | None, masks: Path | None, seed: int, features: int) -> None:
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
+    if seed < 0:
+        raise DataError(f"seed is {seed}; it cannot be below 0")
+    if features < MIN_START:
+        raise DataError(f"features is {features}; a map cannot start with fewer than {MIN_START}")
     check_out(out)
 
 

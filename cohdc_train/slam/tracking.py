@@ -24,7 +24,7 @@ from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse, log
 from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.shutter import unrolled
 
-_MIN_START = 50  # points a first keyframe needs
+MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
 _KEYFRAME_FRAMES = 20
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
@@ -66,7 +66,7 @@ class Tracker:
         self.map = Map(camera)
         self.budget = features
         self.features: Features | None = None  # of the latest frame
-        self.mask: NDArray[np.bool_] | None = None  # what was left out of it: as given, and what geometry found
+        self.mask: NDArray[np.bool_] | None = None  # of it: as given, less what is at rest, and what geometry found
         self._extract = FeatureExtractor(camera, features)
         self._geometry = Geometry(camera)
         self._refiner = Refiner(self.map) if self.method.refinement else None
@@ -98,15 +98,12 @@ class Tracker:
         start = time.perf_counter()
         self._take_in_mapping()
         mask = self.mask = self._dynamic(mask, depth_m, t)
-        twist = self._twist()
-        lag = None if twist is None or depth_t is None else exp_se3(twist * (depth_t - t))
-        features = self._extract(rgb, depth_m, mask, lag)
-        if twist is not None:
-            features = unrolled(features, self.camera, twist)
+        late = None if depth_t is None else depth_t - t
+        features = self._corners(rgb, depth_m, mask, late)
         fit = self._locate(features, rgb)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
-            features = self._extract(rgb, depth_m)
+            features = self._corners(rgb, depth_m, None, late)
             fit = self._locate(features, rgb)
         self.features = features
         tracked = time.perf_counter()
@@ -149,6 +146,15 @@ class Tracker:
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
         return dynamic_mask_of(self._geometry, mask, depth_m, self._velocity @ self._last.T_cw, around, t)
 
+    def _corners(
+        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
+    ) -> Features:
+        """The corners of a frame, all put at its one time; late: s by which depth was taken after colour."""
+        twist = self._twist()
+        lag = None if twist is None or late is None else exp_se3(twist * late)
+        features = self._extract(rgb, depth_m, mask, lag)
+        return features if twist is None else unrolled(features, self.camera, twist)
+
     def _twist(self) -> Array | None:
         """[6] velocity between the last two frames, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t)."""
         if self._last is None or len(self._log) < 2:
@@ -160,7 +166,7 @@ class Tracker:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
-            return Fit(np.eye(4), Matches(empty, empty)) if usable >= _MIN_START else None
+            return Fit(np.eye(4), Matches(empty, empty)) if usable >= MIN_START else None
         if self._last is None:
             return self._localizer.anywhere(features, rgb)
         return self._localizer.near(features, rgb, self._last, self._velocity)

@@ -106,6 +106,22 @@ def test_nothing_at_all_is_an_error_that_leaves_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["rgbd_dataset_freiburg1_none"]
 
 
+def test_a_silence_of_no_length_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="idle is -1"):
+        followed(tmp_path, idle=-1)
+
+
+def test_a_camera_may_fill_one_buffer_again_and_again() -> None:
+    buffer = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+
+    def frames() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float32], float]]:
+        for k in range(3):
+            buffer[:] = k
+            yield buffer, np.zeros(buffer.shape[:2], np.float32), float(k)
+
+    assert [int(view.rgb[0, 0, 0]) for view in list(Live(CAMERA, frames()))] == [0, 1, 2]
+
+
 def test_a_broken_line_or_image_later_on_is_told_and_left_out(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,7 @@
 """What moves without a mask: by depth, by groups of points, and what the tracker makes of both."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,14 @@ from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import dynamic_mask_of
 from cohdc_train.slam.features import FeatureExtractor
 from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.live import Live
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, optimize_pose
+from cohdc_train.slam.playback import play
+from cohdc_train.slam.results import FrameRecord
 from cohdc_train.slam.rigidity import moving_group, pose_of_rest
+from cohdc_train.slam.source import View
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
@@ -104,6 +109,23 @@ def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
 def keyframe(index: int, t: float, nearest: Depth) -> Keyframe:
     nothing = FeatureExtractor(CAMERA, 10)(np.zeros((240, 320, 3), np.uint8), wall())
     return Keyframe(index, t, STILL, nothing, np.zeros(0, dtype=np.int64), np.zeros((30, 40), np.float32), nearest)
+
+
+def test_who_is_at_rest_is_of_use_to_tracking_but_stays_masked_to_watchers(tmp_path: Path) -> None:
+    """A board that stands still under its mask for 3 s."""
+    views = [render([*room(), passer_by(20)], T_wc) for T_wc in camera_path(16)]
+    frames = [(rgb, depth, index / 5) for index, (rgb, depth, _) in enumerate(views)]
+    tracker, seen = Tracker(CAMERA, features=500), []
+
+    def watcher(view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+        assert mask is not None
+        assert tracker.mask is not None
+        board = views[round(5 * view.t)][2]
+        seen.append((mask[board].mean(), tracker.mask[board].mean()))
+
+    play(tracker, Live(CAMERA, frames), lambda view: views[round(5 * view.t)][2], tmp_path / "pictures", [watcher])
+    assert seen[0] == (1, 1)
+    assert seen[-1] == (1, 0)
 
 
 def test_the_camera_may_move() -> None:

@@ -1,10 +1,12 @@
-"""Real time without a clock: what is late is dropped, nothing queues, and a late mask or map does no harm."""
+"""Masks and mapping beside tracking: nothing queues, and a late mask or map does no harm."""
 
 import csv
 import json
+import os
+import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +19,9 @@ from plane_world import CAMERA, camera_path, passer_by, render, room, write_sequ
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.async_masks import AsyncMasks
+from cohdc_train.slam.background_mapping import worker_process
 from cohdc_train.slam.culling import Mask
 from cohdc_train.slam.optimization import exp_se3, to_local
-from cohdc_train.slam.paced import Paced
-from cohdc_train.slam.slot import Slot
 from cohdc_train.slam.source import View
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.window import Solution, close_window, open_window
@@ -29,132 +30,11 @@ from cohdc_train.trajectory import Trajectory, score
 LONG = 20.0  # s: no wait of a thread here takes that long unless it hangs
 
 
-def test_a_slot_holds_the_newest_and_counts_the_rest() -> None:
-    slot: Slot[int] = Slot()
-    assert slot.poll() is None
-    for number in range(1000):
-        slot.put(number)
-    assert slot.take() == 999
-    assert slot.dropped == 999
-    assert slot.poll() is None
-    slot.put(7)
-    slot.close()
-    assert slot.take() == 7, "what was there when it closed is still given"
-    assert slot.take() is None
-
-
-def test_a_slot_closed_with_an_error_raises_it_where_it_is_read() -> None:
-    slot: Slot[int] = Slot()
-    slot.close(DataError("broken.png: not an image"))
-    with pytest.raises(DataError, match=r"broken\.png"):
-        slot.take()
-
-
 def view(index: int, rgb: np.ndarray | None = None, depth: np.ndarray | None = None) -> View:
     nothing = np.zeros((CAMERA.height, CAMERA.width), dtype=np.float32)
     black = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
     t = 100 + index / 30
     return View(t, f"{t:.6f}", f"{index}", black if rgb is None else rgb, nothing if depth is None else depth)
-
-
-class Gated:
-    """A source that makes a view when it is let; `asked` tells how many views have been asked for."""
-
-    camera, groundtruth, without_depth = CAMERA, None, 0
-
-    def __init__(self, count: int, broken: int | None = None) -> None:
-        self.count, self.broken = count, broken
-        self.allowed = threading.Semaphore(0)
-        self.asked = 0
-        self.changed = threading.Condition()
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __iter__(self) -> Iterator[View]:
-        for index in range(self.count + 1):
-            with self.changed:
-                self.asked += 1
-                self.changed.notify_all()
-            assert self.allowed.acquire(timeout=LONG)
-            if index == self.broken:
-                raise DataError("7.png: broken")
-            if index < self.count:
-                yield view(index)
-
-    def let(self, views: int) -> None:
-        """Make so many views, and wait until the reader comes for the one after."""
-        with self.changed:
-            goal = self.asked + views
-            self.allowed.release(views)
-            assert self.changed.wait_for(lambda: self.asked >= goal, LONG)
-
-
-class Still:
-    """A clock that goes only when it is told to."""
-
-    def __init__(self) -> None:
-        self.time = 0.0
-        self.waits: list[float] = []
-
-    def now(self) -> float:
-        return self.time
-
-    def wait_until(self, moment: float) -> None:
-        self.waits.append(moment)
-
-
-def test_views_that_come_while_the_tracker_is_busy_are_dropped_and_counted() -> None:
-    source, clock = Gated(9), Still()
-    source.allowed.release(2)
-    given = []
-    with Paced(source, clock) as paced:
-        for taken in paced:
-            given.append(int(taken.name))
-            if given == [0, 1]:
-                source.let(5)
-                clock.time += 0.2  # views 2..6 come in this time
-            elif given[-1] == 6:
-                source.allowed.release(3)
-    assert given[:3] == [0, 1, 6]
-    assert paced.dropped == 9 - len(given)
-    assert paced.dropped >= 4
-    np.testing.assert_allclose(clock.waits, np.arange(1, 9) / 30, atol=1e-9)
-    np.testing.assert_allclose(paced.latencies[0], 0.2 - 1 / 30, atol=1e-9)
-    assert len(paced.latencies) == len(given) - 1
-
-
-class SlowToRead:
-    """Four views that take 0.1 s each to make."""
-
-    camera, groundtruth, without_depth = CAMERA, None, 0
-
-    def __init__(self, clock: Still) -> None:
-        self.clock = clock
-
-    def __len__(self) -> int:
-        return 4
-
-    def __iter__(self) -> Iterator[View]:
-        for index in range(4):
-            self.clock.time += 0.1
-            yield view(index)
-
-
-def test_reading_slower_than_the_recording_delays_it_instead_of_piling_up() -> None:
-    clock = Still()
-    with Paced(SlowToRead(clock), clock) as paced:
-        given = list(paced)
-    assert paced.behind == pytest.approx(3 * (0.1 - 1 / 30))
-    np.testing.assert_allclose(clock.waits, [0.2, 0.3, 0.4])
-    assert len(given) + paced.dropped == 4
-
-
-def test_a_broken_image_ends_the_run_with_its_error() -> None:
-    source = Gated(9, broken=3)
-    source.allowed.release(9)
-    with Paced(source, Still()) as paced, pytest.raises(DataError, match=r"7\.png: broken"):
-        list(paced)
 
 
 class Segmenter:
@@ -298,6 +178,17 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
         "a solution for poses that somebody else has moved since is of no use"
     )
     np.testing.assert_allclose(newest.T_cw, step @ window.poses[-1])
+
+
+def test_a_terminals_ctrl_c_does_not_end_the_worker() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have us ignore it
+    try:
+        with worker_process() as executor:
+            os.kill(executor.submit(os.getpid).result(), signal.SIGINT)
+            time.sleep(0.2)
+            assert executor.submit(pow, 2, 3).result() == 8, "what is left of the map is still adjusted"
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_the_command_in_real_time_accounts_for_every_frame(tmp_path: Path) -> None:

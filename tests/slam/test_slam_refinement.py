@@ -1,5 +1,7 @@
 """Photometric refinement: known shifts, known affine maps, and what must stay where it is."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ from hypothesis import strategies as st
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
 from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, exp_se3, to_local
-from cohdc_train.slam.refinement import Pyramid, affine, align, square, warped
+from cohdc_train.slam.refinement import Pyramid, Refiner, affine, align, square, warped
 from cohdc_train.slam.tracking import Tracker
 
 PICTURE = cv2.cvtColor(cv2.GaussianBlur(texture(np.random.default_rng(0), 240, 320), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)
@@ -50,14 +53,14 @@ def test_a_patch_is_turned_and_scaled() -> None:
 @pytest.fixture(scope="module")
 def tracker() -> Tracker:
     """One keyframe of a wall that faces it."""
-    wall = Rectangle(np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 4.0, 0]), PICTURE_RGB)
-    rgb, depth, _ = render([wall], np.eye(4))
     tracker = Tracker(CAMERA, features=200)
-    tracker.track(rgb, depth, 0.0)
+    tracker.track(FIRST_VIEW, FIRST_DEPTH, 0.0)
     return tracker
 
 
 PICTURE_RGB = texture(np.random.default_rng(3), 600, 900)
+WALL = Rectangle(np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 4.0, 0]), PICTURE_RGB)
+FIRST_VIEW, FIRST_DEPTH, _ = render([WALL], np.eye(4))
 
 
 def test_the_affine_map_is_the_projections_derivative(tracker: Tracker) -> None:
@@ -73,6 +76,22 @@ def test_the_affine_map_is_the_projections_derivative(tracker: Tracker) -> None:
     for axis in range(2):
         moved = CAMERA.backproject(first + tiny * np.eye(2)[axis], world.positions[ids, 2])
         np.testing.assert_allclose(A[:, :, axis], (seen(moved) - seen(world.positions[ids])) / tiny, atol=1e-3)
+
+
+def test_what_a_rolling_shutter_moved_stays_moved(tracker: Tracker) -> None:
+    keyframe = tracker.map.keyframes[0]
+    corners = np.flatnonzero(keyframe.point_ids >= 0)
+    matches, features = Matches(keyframe.point_ids[corners], corners), keyframe.features
+    pyramid = Pyramid(np.asarray(cv2.cvtColor(FIRST_VIEW, cv2.COLOR_RGB2GRAY), np.uint8))
+    refiner = Refiner(tracker.map)
+    refiner.remember(keyframe, pyramid)
+    aside = replace(features, pixels=features.pixels + 0.4)
+    refined = [
+        refiner.refine(replace(aside, points=aside.points + shift), matches, keyframe.T_cw, pyramid).points
+        for shift in (0.0, 3.0)
+    ]
+    assert (refined[0] != features.points).any()
+    np.testing.assert_allclose(refined[1] - refined[0], 3.0)
 
 
 def test_a_map_of_refined_measurements_fits_better() -> None:

@@ -88,10 +88,12 @@ def test_without_masks_or_geometry_the_passer_by_spoils_it_and_a_rerun_replaces_
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "old.jpg").touch()
     (tmp_path / "mine.txt").touch()
+    (tmp_path / "cloud.ply").touch()
     metrics = slam(sequence=sequence, out=tmp_path, features=500, method=Method(geometry=False, static_weights=False))
     assert metrics["ate_m"]["rmse"] > 5 * good
     assert metrics["ms"]["segment"]["p95"] == 0
     assert (tmp_path / "mine.txt").exists()
+    assert not (tmp_path / "cloud.ply").exists(), "a former run's cloud is not this one's"
     pictures = [path.name for path in (tmp_path / "pictures").iterdir()]
     assert len(pictures) == 6
     assert "old.jpg" not in pictures
@@ -106,8 +108,9 @@ def test_without_masks_or_geometry_the_passer_by_spoils_it_and_a_rerun_replaces_
         (lambda root: (root / "camera.yaml").write_text("fx: 1\n fy: 2\n"), "camera.yaml:2: broken yaml"),
         (lambda root: (root / "camera.yaml").write_text(CAMERA_YAML.replace("320", "640")), "the camera says 640x240"),
         (lambda root: next((root / "masks").iterdir()).unlink(), "masks/100.000000.png: cannot be read"),
+        (lambda root: (root / "groundtruth.txt").write_text("1 2 3\n"), "groundtruth.txt:1: 3 numbers"),
     ],
-    ids=["no list", "broken list", "no camera", "broken camera", "wrong size", "mask missing"],
+    ids=["no list", "broken list", "no camera", "broken camera", "wrong size", "mask missing", "broken truth"],
 )
 def test_a_users_error_is_one_line_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: object, said: str
@@ -137,6 +140,30 @@ def test_out_must_not_be_a_file(tmp_path: Path) -> None:
     (tmp_path / "out").touch()
     with pytest.raises(DataError, match="is a file"):
         slam(sequence=tmp_path, out=tmp_path / "out")
+
+
+def test_out_must_be_writable(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="out: cannot be written"):
+        slam(sequence=tmp_path, out=tmp_path / "file" / "out")
+
+
+@pytest.mark.parametrize(("name", "value"), [("seed", -1), ("features", 0), ("features", -5)])
+def test_numbers_that_cannot_be_are_told(tmp_path: Path, name: str, value: int) -> None:
+    with pytest.raises(DataError, match=f"{name} is {value}"):
+        slam(sequence=tmp_path, out=tmp_path / "out", **{name: value})  # type: ignore[arg-type]
+
+
+def test_a_truth_of_another_time_costs_the_scores_not_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_sequence(tmp_path / "room", 4)
+    (root / "groundtruth.txt").write_text("7.0 0 0 0 0 0 0 1\n7.1 0 0 0 0 0 0 1\n7.2 0 0 0 0 0 0 1\n")
+    metrics = slam(sequence=root, out=tmp_path / "out", features=200)
+    assert metrics["tracked"] == 4
+    assert "ate_m" not in metrics
+    assert "no scores: 0 of 4 poses lie within" in capsys.readouterr().err
+    assert (tmp_path / "out" / "trajectory.txt").is_file()
 
 
 class TwoClasses:

@@ -101,7 +101,7 @@ def test_a_camera_with_a_baseline_needs_no_depth_scale(tmp_path: Path) -> None:
         (CAMERA_YAML, "needs baseline"),
         (STEREO_YAML + "k1: 0.1\n", "no distortion"),
         (STEREO_YAML.replace("fy: 260", "fy: 200"), "fx = fy"),
-        (STEREO_YAML.replace("0.12", "-0.12"), "camera.yaml:7: baseline is a distance and cannot be -0.12"),
+        (STEREO_YAML.replace("0.12", "-0.12"), "camera.yaml:7: baseline cannot be below 0, and is -0.12"),
         (STEREO_YAML.replace("baseline: 0.12", ""), "missing depth_scale"),
     ],
     ids=["no baseline", "distortion", "two focal lengths", "negative", "neither"],

@@ -90,6 +90,44 @@ def test_a_mask_over_everything_costs_no_frame_once_there_is_a_map(views: list[V
     assert ate(tracker, camera_path(40)) < 0.005
 
 
+def test_a_picture_matched_whole_takes_depth_at_its_own_time_too(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker = Tracker(CAMERA, features=500)
+    for index, (rgb, depth, _) in enumerate(views[:4]):
+        tracker.track(rgb, depth, index / 30)
+    extract, lags = tracker._extract, []
+
+    def watched(
+        rgb: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        mask: NDArray[np.bool_] | None,
+        lag: NDArray[np.float64] | None,
+    ) -> Features:
+        lags.append(lag)
+        return extract(rgb, depth, mask, lag)
+
+    monkeypatch.setattr(tracker, "_extract", watched)
+    assert tracker.track(*views[4][:2], 4 / 30, EVERYTHING, depth_t=4 / 30 + 0.01).tracked
+    assert len(lags) == 2, "first what is not masked, then all"
+    assert lags[0] is not None
+    np.testing.assert_array_equal(lags[1], lags[0])
+
+
+def test_a_pose_that_is_rejected_judges_no_point(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = Tracker(CAMERA, features=500)
+    for index, (rgb, depth, _) in enumerate(views[:2]):
+        tracker.track(rgb, depth, index / 30)
+
+    def wrong(T_cw: NDArray[np.float64], points: NDArray[np.float64], *_: object) -> tuple[object, object, object]:
+        nothing = np.zeros(len(points), dtype=np.bool_)
+        return T_cw, nothing, ~nothing
+
+    monkeypatch.setattr("cohdc_train.slam.localization.pose_of_rest", wrong)
+    assert not tracker.track(*views[2][:2], 2 / 30).tracked
+    np.testing.assert_array_equal(tracker.map.moved, 0)
+
+
 def features_at(points: list[tuple[float, float]], words: list[int], octaves: list[int]) -> Features:
     pixels = np.array(points, dtype=np.float64)
     descriptors = np.zeros((len(words), 4), dtype=np.uint64)
