@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -118,7 +119,7 @@ class FeatureExtractor:
             found = self._detectors[k].detect(gray, allowed)
             if len(found) >= enough:
                 break
-        responses = np.fromiter((corner.response for corner in found), np.float64, len(found))
+        responses = np.fromiter(map(attrgetter("response"), found), np.float64, len(found))
         while k > 0 and np.count_nonzero(responses >= _THRESHOLDS[k - 1]) >= enough:
             k -= 1
         self._latest = k
@@ -130,7 +131,7 @@ class FeatureExtractor:
 def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """[n, 2] px and [n] pyramid levels."""
     pixels = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64).reshape(-1, 2)
-    return pixels, np.fromiter((k.octave for k in corners), np.int64, len(corners))
+    return pixels, np.fromiter(map(attrgetter("octave"), corners), np.int64, len(corners))
 
 
 def _orb(count: int, threshold: int) -> cv2.ORB:

@@ -83,6 +83,14 @@ def log_se3(T: Array) -> Array:
     return np.concatenate([(left @ T[..., :3, 3:])[..., 0], phi], axis=-1)
 
 
+def part_of(T: Array, share: float) -> Array:
+    """A share of a small motion [4, 4], also a negative one: the turn's angle and the shift times that."""
+    result = np.eye(4)
+    result[:3, :3] = cv2.Rodrigues(share * np.asarray(cv2.Rodrigues(T[:3, :3])[0]))[0]
+    result[:3, 3] = share * T[:3, 3]
+    return result
+
+
 def inverse(T: Array) -> Array:
     """T: [..., 4, 4] rigid. Returns [..., 4, 4]."""
     result = np.zeros_like(T)

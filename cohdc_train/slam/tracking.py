@@ -20,7 +20,7 @@ from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse, log_se3
+from cohdc_train.slam.optimization import Array, Weighing, inverse, part_of
 from cohdc_train.slam.refinement import Pyramid, Refiner
 
 _MIN_START = 50  # points a first keyframe needs
@@ -151,7 +151,7 @@ class Tracker:
         step = self._log[-1][0] - self._log[-2][0]
         if not 0 < step <= _LONGEST:
             return None
-        return exp_se3(log_se3(self._velocity) * ((depth_t - t) / step))
+        return part_of(self._velocity, (depth_t - t) / step)
 
     def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
         if not self.map.keyframes:
