@@ -88,7 +88,7 @@ def one_to_one(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Candidate pairs [k] with their distances, thinned: the best j of every i that passes the ratio, then of every j
     the best i."""
-    order = np.lexsort((j, bits, i))
+    order = _by(i, bits, j)
     i, j, bits = i[order], j[order], bits[order]
     first = np.r_[True, i[1:] != i[:-1]][: len(i)]
     best = np.flatnonzero(first)
@@ -96,9 +96,14 @@ def one_to_one(
     has_second = (second > best) & (i[second] == i[best])
     clear = ~has_second | (bits[best] <= ratio * bits[second])
     i, j, bits = i[best][clear], j[best][clear], bits[best][clear]
-    order = np.lexsort((i, bits, j))
+    order = _by(j, bits, i)
     first = np.r_[True, j[order][1:] != j[order][:-1]][: len(j)]
     return i[order][first], j[order][first]
+
+
+def _by(first: NDArray[np.int64], bits: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The order by first, then bits, 0..256, then last, of rows that all differ: one key sorts faster than three."""
+    return np.argsort((first * 257 + bits) * (int(last.max(initial=0)) + 1) + last)
 
 
 def match_descriptors(
