@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -14,8 +16,8 @@ SCALE = 1.2  # between two levels of the image pyramid
 LEVELS = 8
 _CELL = 32  # px at the level of the corner
 _POOL = 2.0  # corners detected per corner kept: what the grid chooses from
-_ENOUGH = 1.6  # the same, below which the second threshold is tried
-_THRESHOLDS = (20, 7)  # of FAST, grey levels
+_ENOUGH = 1.6  # the same, below which the next threshold is tried
+_THRESHOLDS = (40, 20, 12, 7)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
 _EDGE_PATCH = 2  # px: a depth edge this near to a corner spoils its depth
 _EDGE_RELATIVE = 0.04  # of the depth: a larger step inside the patch is an edge
 _MASK_BAND = 2  # px beside the mask where depth is refused
@@ -57,6 +59,7 @@ class FeatureExtractor:
         self.camera = camera
         self.budget = budget
         self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]
+        self._latest = 0  # threshold that was low enough for the latest frame
         shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
         self._scales = SCALE ** np.arange(LEVELS)
         self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
@@ -74,8 +77,7 @@ class FeatureExtractor:
         """
         gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
-        found = self._detect(gray, allowed)
-        table = np.column_stack([*_places(found), np.fromiter((k.response for k in found), float, len(found))])
+        found, table = self._detect(gray, allowed)
         chosen = spread(table, self._quota)
         kept, words = self._detectors[0].compute(gray, [found[i] for i in chosen])
         if words is None:
@@ -105,16 +107,31 @@ class FeatureExtractor:
         moved = sample_depth(depth, pixels + shift, mask)
         return to_local(inverse(lag), self.camera.backproject(points + shift, moved))[:, 2]
 
-    def _detect(self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None) -> Sequence[cv2.KeyPoint]:
-        """Strong corners, which are quick to find; where they do not suffice, weak ones too."""
-        found = self._detectors[0].detect(gray, allowed)
-        return found if len(found) >= _ENOUGH * self.budget else self._detectors[1].detect(gray, allowed)
+    def _detect(
+        self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None
+    ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float64]]:
+        """Corners above the highest threshold that leaves enough, and the table of them that `spread` takes.
+
+        Which threshold was tried first, the latest frame's, makes no difference to that.
+        """
+        enough = _ENOUGH * self.budget
+        for k in range(self._latest, len(_THRESHOLDS)):
+            found = self._detectors[k].detect(gray, allowed)
+            if len(found) >= enough:
+                break
+        responses = np.fromiter(map(attrgetter("response"), found), np.float64, len(found))
+        while k > 0 and np.count_nonzero(responses >= _THRESHOLDS[k - 1]) >= enough:
+            k -= 1
+        self._latest = k
+        strong = responses >= _THRESHOLDS[k]
+        found = list(compress(found, strong))
+        return found, np.column_stack([*_places(found), responses[strong]])
 
 
 def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """[n, 2] px and [n] pyramid levels."""
     pixels = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64).reshape(-1, 2)
-    return pixels, np.fromiter((k.octave for k in corners), np.int64, len(corners))
+    return pixels, np.fromiter(map(attrgetter("octave"), corners), np.int64, len(corners))
 
 
 def _orb(count: int, threshold: int) -> cv2.ORB:
@@ -133,15 +150,16 @@ def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.i
 
     table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level. Returns rising rows.
     """
-    octave = table[:, 2].astype(np.int64)
-    size = _CELL * SCALE**octave
-    column, row = (table[:, 0] // size).astype(np.int64), (table[:, 1] // size).astype(np.int64)
+    best_first = np.argsort(-table[:, 3], kind="stable")
+    octave = table[best_first, 2].astype(np.int64)
+    column, row = (table[best_first, :2].T // (_CELL * SCALE ** np.arange(LEVELS))[octave]).astype(np.int64)
     cell = (octave * 10_000 + row) * 10_000 + column
-    order = np.lexsort((-table[:, 3], cell))
+    order = np.argsort(cell, kind="stable")
     rank = np.empty(len(table), dtype=np.int64)
     rank[order] = _running_index(cell[order])
-    order = np.lexsort((-table[:, 3], rank, octave))
-    return np.sort(order[_running_index(octave[order]) < quota[octave[order]]])
+    order = np.argsort(octave * len(table) + rank, kind="stable")
+    chosen = order[_running_index(octave[order]) < quota[octave[order]]]
+    return np.sort(best_first[chosen])
 
 
 def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -163,12 +181,12 @@ def sample_depth(
     height, width = depth.shape
     offsets = np.arange(-_EDGE_PATCH, _EDGE_PATCH + 1)
     x, y = np.rint(pixels).astype(np.int64).T
-    columns = np.clip(x[:, None, None] + offsets[None, None, :], 0, width - 1)
-    rows = np.clip(y[:, None, None] + offsets[None, :, None], 0, height - 1)
-    patch = depth[rows, columns].reshape(len(pixels), -1)
-    centre = patch[:, patch.shape[1] // 2].astype(np.float64)
-    far = patch.max(axis=1).astype(np.float64)
-    near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=1).astype(np.float64)
+    columns = np.clip(x + offsets[:, None], 0, width - 1)
+    rows = np.clip(y + offsets[:, None], 0, height - 1)
+    patch = depth.ravel().take((rows[:, None] * width + columns).reshape(-1, len(pixels)))  # [25, n]
+    centre = patch[len(patch) // 2].astype(np.float64)
+    far = patch.max(axis=0).astype(np.float64)
+    near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=0).astype(np.float64)
     refused = (centre <= 0) | (far - near > _EDGE_RELATIVE * centre)
     if mask is not None:
         reach = np.ones((2 * _MASK_BAND + 1, 2 * _MASK_BAND + 1), dtype=np.uint8)

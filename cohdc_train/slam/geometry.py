@@ -77,8 +77,8 @@ class Geometry:
         )
         self._measured = _maps((camera.distort(coarse) - _CENTRE) / _STEP, self._shape)
         whole = (camera.height, camera.width)
-        flat = _maps((camera.undistort(_grid(*whole)) - _CENTRE) / _STEP, whole)
-        self._flat = cv2.convertMaps(*flat, cv2.CV_16SC2)
+        flat = cv2.convertMaps(*_maps(camera.undistort(_grid(*whole)), whole), cv2.CV_16SC2, nninterpolation=True)
+        self._flat = flat[0]  # where each pixel would be without distortion, whole px
 
     def nearest(self, depth: NDArray[np.float32]) -> Coarse:
         """What a keyframe remembers of its depth image [H, W] m: the least around every coarse pixel."""
@@ -103,7 +103,9 @@ class Geometry:
         found = _whole(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
         if not found.any() or np.count_nonzero(found) > _MOST * np.count_nonzero(image):
             return np.zeros((self.camera.height, self.camera.width), dtype=np.bool_)
-        return np.asarray(cv2.remap(found.astype(np.uint8) * 255, *self._flat, cv2.INTER_LINEAR) > 127)
+        size = (_STEP * self._shape[1], _STEP * self._shape[0])
+        smooth = cv2.resize(found.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(cv2.remap(smooth, self._flat, np.empty(0), cv2.INTER_NEAREST) > 127)
 
     def at_rest(self, mask: NDArray[np.bool_], comparison: Comparison) -> NDArray[np.bool_]:
         """The connected parts of a mask [H, W] that lie where every reference that could see them saw a surface.
@@ -124,10 +126,12 @@ class Geometry:
         """The least reading of every block, 0 where less than half of it has one."""
         h, w = self._shape
         depth = depth[: h * _STEP, : w * _STEP]
-        known = depth > 0
-        least = np.where(known, depth, np.float32(np.inf)).reshape(h, _STEP, w * _STEP).min(axis=1)
-        least = np.ascontiguousarray(least.reshape(h, w, _STEP).transpose(2, 0, 1)).min(axis=0)
-        share = cv2.resize(known.view(np.uint8) * np.uint8(128), (w, h), interpolation=cv2.INTER_AREA)
+        # Read as integers, floats from 0 up keep their order; one less, and 0, no reading, becomes the largest.
+        bits = (depth.view(np.uint32) - np.uint32(1)).reshape(h, _STEP, w * _STEP).min(axis=1)
+        bits = np.ascontiguousarray(bits.reshape(h, w, _STEP).transpose(2, 0, 1)).min(axis=0)
+        least = (bits + np.uint32(1)).view(np.float32)
+        known = (depth > 0).view(np.uint8) * np.uint8(128)
+        share = cv2.resize(known, (w, h), interpolation=cv2.INTER_AREA)  # mean: 64 is half of a block
         image = np.where((share >= 64) & (least < _FAR), least, 0.0).astype(np.float32)
         return np.asarray(cv2.remap(image, *self._measured, cv2.INTER_NEAREST), dtype=np.float32)
 

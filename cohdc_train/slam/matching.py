@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features import Features, hamming
+from cohdc_train.slam.features import LEVELS, Features, hamming
 
 _WIDEST = 2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
 
@@ -50,11 +50,9 @@ def match_projected(
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     reach = radius * np.minimum(features.sigmas, _WIDEST)
-    i, j = _neighbours(projected.pixels, features.points, float(reach.max()))
-    near = np.abs(features.octaves[j] - projected.levels[i]) <= 1
-    i, j = i[near], j[near]
-    offset = projected.pixels[i] - features.points[j]
-    near = np.einsum("kc,kc->k", offset, offset) <= reach[j] ** 2
+    i, j = _neighbours(projected, features, float(reach.max()))
+    x, y = projected.pixels.T.take(i, axis=1) - features.points.T.take(j, axis=1)
+    near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])
     i, j = i[near], j[near]
     bits = hamming(projected.descriptors[i], features.descriptors[j])
     keep = bits <= max_distance
@@ -62,28 +60,27 @@ def match_projected(
     return Matches(projected.ids[i], j)
 
 
-def _neighbours(
-    first: NDArray[np.float64], second: NDArray[np.float64], reach: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """first: [m, 2]; second: [n, 2] px. Returns pairs (i, j) [k] each: all that lie within reach, and some that do not.
+def _neighbours(projected: Projected, features: Features, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of a point and a corner, [k] rows of each: all within one level and `reach` px, and some further off.
 
-    The points of `second` are sorted into square cells of that size; the three cells of a row beside each other that
-    a point of `first` looks at are then one piece of the sorted list.
+    Corners are sorted by level and square cell of that size. The three cells side by side in which a point looks are
+    then one piece of the sorted list; there are nine such pieces, of three rows on three levels.
     """
-    corner = second.min(axis=0) - reach
-    cells = ((second - corner) / reach).astype(np.int64)  # from 1 on: there is a rim of empty cells
+    corner = features.points.min(axis=0) - reach
+    cells = ((features.points - corner) / reach).astype(np.int64)  # from 1 on: a rim of empty cells lies around
     width, height = (cells.max(axis=0) + 2).tolist()
-    key = cells[:, 1] * width + cells[:, 0]
+    key = ((features.octaves + 1) * height + cells[:, 1]) * width + cells[:, 0]
     order = np.argsort(key, kind="stable")
-    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=width * height))]
-    places = np.floor((first - corner) / reach).astype(np.int64)
+    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=(LEVELS + 2) * height * width))]
+    places = np.floor((projected.pixels - corner) / reach).astype(np.int64)
     x, y = np.clip(places, 0, (width - 1, height - 1)).T
-    rows = np.clip(y + np.array([[-1], [0], [1]]), 0, height - 1) * width  # a row at the border, twice, is empty
-    low = begins[rows + np.maximum(x - 1, 0)]
-    count = (begins[rows + np.minimum(x + 2, width)] - low).ravel()
-    starts = low.ravel() - np.cumsum(count) + count
-    j = order[np.repeat(starts, count) + np.arange(count.sum())]
-    return np.repeat(np.tile(np.arange(len(first)), 3), count), j
+    beside = np.arange(-1, 2)[:, None]
+    levels = projected.levels + 1 + beside[:, None]
+    rows = (levels * height + np.clip(y + beside, 0, height - 1)) * width  # a row at the rim comes twice, but is empty
+    low = begins[rows + np.maximum(x - 1, 0)].ravel()
+    count = begins[rows + np.minimum(x + 2, width)].ravel() - low
+    j = order[np.repeat(low - np.cumsum(count) + count, count) + np.arange(count.sum())]
+    return np.repeat(np.tile(np.arange(len(x)), 9), count), j
 
 
 def one_to_one(
@@ -91,7 +88,7 @@ def one_to_one(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Candidate pairs [k] with their distances, thinned: the best j of every i that passes the ratio, then of every j
     the best i."""
-    order = np.lexsort((j, bits, i))
+    order = _by(i, bits, j)
     i, j, bits = i[order], j[order], bits[order]
     first = np.r_[True, i[1:] != i[:-1]][: len(i)]
     best = np.flatnonzero(first)
@@ -99,9 +96,14 @@ def one_to_one(
     has_second = (second > best) & (i[second] == i[best])
     clear = ~has_second | (bits[best] <= ratio * bits[second])
     i, j, bits = i[best][clear], j[best][clear], bits[best][clear]
-    order = np.lexsort((i, bits, j))
+    order = _by(j, bits, i)
     first = np.r_[True, j[order][1:] != j[order][:-1]][: len(j)]
     return i[order][first], j[order][first]
+
+
+def _by(first: NDArray[np.int64], bits: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The order by first, then bits, 0..256, then last, of rows that all differ: one key sorts faster than three."""
+    return np.argsort((first * 257 + bits) * (int(last.max(initial=0)) + 1) + last)
 
 
 def match_descriptors(

@@ -42,8 +42,8 @@ def ransac_pose(
     poses = [] if guess is None else [guess[None]]
     with_depth = np.flatnonzero(~np.isnan(seen.depths))
     if len(with_depth) >= 3:
-        # Three different rows of each line of random numbers: the places of its three smallest.
-        triples = with_depth[np.argpartition(rng.random((hypotheses, len(with_depth))), 2, axis=1)[:, :3]]
+        # A triple that has one match twice fits no other: it loses, and is rare.
+        triples = with_depth[rng.integers(0, len(with_depth), (hypotheses, 3))]
         local = camera.backproject(seen.pixels, seen.depths)
         poses.append(rigid_transforms(points[triples], local[triples]))
     if not poses:
@@ -56,10 +56,11 @@ def ransac_pose(
 
 def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera) -> NDArray[np.bool_]:
     """[h, m] whether a match agrees with a hypothesis, in pixels and, where measured, in depth."""
-    local = points[None] @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-    z = np.maximum(local[..., 2], _NEAR)
-    error_u = camera.fx * local[..., 0] / z + camera.cx - seen.pixels[:, 0]
-    error_v = camera.fy * local[..., 1] / z + camera.cy - seen.pixels[:, 1]
+    turned = (poses[:, :3, :3].reshape(-1, 3) @ points.T).reshape(len(poses), 3, -1)
+    x, y, depth = (turned + poses[:, :3, 3:]).transpose(1, 0, 2)
+    z = np.maximum(depth, _NEAR)
+    error_u = camera.fx * x / z + (camera.cx - seen.pixels[:, 0])
+    error_v = camera.fy * y / z + (camera.cy - seen.pixels[:, 1])
     agree = error_u**2 + error_v**2 <= (_PIXEL_TOLERANCE * seen.sigmas) ** 2
-    agree &= ~(np.abs(local[..., 2] - seen.depths) > _DEPTH_TOLERANCE * z)  # a depth of nan disagrees with nothing
-    return np.asarray(agree & (local[..., 2] > _NEAR))
+    agree &= ~(np.abs(depth - seen.depths) > _DEPTH_TOLERANCE * z)  # a depth of nan disagrees with nothing
+    return np.asarray(agree & (depth > _NEAR))

@@ -9,7 +9,6 @@ measurement allow, moves. The poses of all groups come from sums of the same nor
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import linkage
-from scipy.spatial.distance import cdist
 
 from cohdc_train.slam.optimization import (
     Array,
@@ -116,11 +115,13 @@ def nested_groups(local: Array) -> NDArray[np.bool_]:
 
 def _patches(local: Array) -> tuple[NDArray[np.bool_], Array]:
     """Points by the nearest of a few that lie far apart: [p, m] bool, and the patches' middles [p, 3] m."""
-    chosen = [int(np.argmin(local[:, 2]))]
-    distance = np.full(len(local), np.inf)
-    for _ in range(min(_PATCHES, len(local)) - 1):
-        distance = np.minimum(distance, ((local - local[chosen[-1]]) ** 2).sum(axis=1))
-        chosen.append(int(np.argmax(distance)))
-    nearest = cdist(local, local[chosen]).argmin(axis=1)
+    x, y, z = np.ascontiguousarray(local.T)
+    middle = int(np.argmin(z))
+    distance, nearest = np.full(len(local), np.inf), np.zeros(len(local), dtype=np.int64)
+    for patch in range(min(_PATCHES, len(local))):
+        square = (x - x[middle]) ** 2 + (y - y[middle]) ** 2 + (z - z[middle]) ** 2
+        nearest[square < distance] = patch
+        np.minimum(distance, square, out=distance)
+        middle = int(np.argmax(distance))
     patches = nearest[None] == np.unique(nearest)[:, None]
     return patches, (patches @ local) / patches.sum(axis=1)[:, None]
