@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.camera import Camera, maps_onto
 from cohdc_train.slam.optimization import Array, exp_se3, inverse, to_local
 
 _SIDE = 160  # px of a picture's longer side
@@ -73,8 +73,7 @@ def take_picture(
     width, height = round(camera.width * scale), round(camera.height * scale)
     cx, cy = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
     small = Camera(camera.fx * scale, camera.fy * scale, cx, cy, width, height, camera.depth_scale)
-    bent = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
-    maps = cv2.initUndistortRectifyMap(camera.matrix(), bent, None, small.matrix(), (width, height), cv2.CV_32FC1)
+    maps = maps_onto(camera, small)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     gray = cv2.GaussianBlur(gray, (0, 0), 0.5 / scale) if scale < 1 else gray
     still = depth if mask is None else np.where(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0, 0, depth)
@@ -91,17 +90,18 @@ def align(of_map: Picture, local: Picture, T: Array) -> Alignment | None:
 
     Returns None when the pictures hardly overlap or there is nothing to hold on to.
     """
-    start = _compare(_Template(of_map), local, T)
+    pairs = [(of_map, local)]
+    for _ in range(_LEVELS - 1):
+        pairs.append((pairs[-1][0].half(), pairs[-1][1].half()))
+    levels = [(_Template(picture), other) for picture, other in pairs]
+    start = _compare(*levels[0], T)
     refined = T
-    for level in reversed(range(_LEVELS)):
-        pair = (of_map, local)
-        for _ in range(level):
-            pair = (pair[0].half(), pair[1].half())
-        found = _align_level(_Template(pair[0]), pair[1], refined)
+    for template, other in reversed(levels):
+        found = _align_level(template, other, refined)
         if found is None:
             return None
         refined = found
-    end = _compare(_Template(of_map), local, refined)
+    end = _compare(*levels[0], refined)
     if start is None or end is None:
         return None
     correlation = float(np.corrcoef(end.template, end.sampled)[0, 1])

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import asdict, dataclass, fields
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -45,28 +46,31 @@ class Camera:
         """m: depth beyond errs too much to begin with: by 4 cm and more, a Kinect's; 40 baselines, a stereo pair's."""
         return 40 * self.baseline if self.baseline else 5.0
 
+    @property
+    def distortion(self) -> NDArray[np.float64]:
+        """[5] Brown-Conrady coefficients in OpenCV's order, all 0 for a lens without."""
+        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
+
     def matrix(self) -> NDArray[np.float64]:
         """K: [3, 3], px."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """pixels: [n, 2] as measured, px. Returns [n, 2] px where a lens without distortion would put them."""
-        coefficients = np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
-        if not coefficients.any() or len(pixels) == 0:
+        if not self.distortion.any() or len(pixels) == 0:
             return np.asarray(pixels, dtype=np.float64).copy()
         # The default stops at an error of 0.01 px and more in the corners of freiburg1.
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-6)
         points = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        flat = cv2.undistortImagePoints(points, self.matrix(), coefficients, None, criteria)
+        flat = cv2.undistortImagePoints(points, self.matrix(), self.distortion, None, criteria)
         return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
 
     def distort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """pixels: [n, 2] without distortion, px. Returns [n, 2] px where the lens puts them: undistort's inverse."""
-        coefficients = np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
-        if not coefficients.any() or len(pixels) == 0:
+        if not self.distortion.any() or len(pixels) == 0:
             return np.asarray(pixels, dtype=np.float64).copy()
         rays = self.backproject(pixels, np.ones(len(pixels))).reshape(-1, 1, 3)
-        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.matrix(), coefficients)
+        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.matrix(), self.distortion)
         return np.asarray(bent, dtype=np.float64).reshape(-1, 2)
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -83,6 +87,15 @@ class Camera:
     def as_dict(self) -> dict[str, float]:
         """What the yaml file of this camera holds."""
         return asdict(self)
+
+
+@cache
+def maps_onto(camera: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What cv2.remap needs to make a camera's image one that a pinhole camera in its place would take."""
+    size = (pinhole.width, pinhole.height)
+    matrices = camera.matrix(), camera.distortion, None, pinhole.matrix()
+    x, y = cv2.initUndistortRectifyMap(*matrices, size, cv2.CV_32FC1)
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
 def load_camera(path: Path) -> Camera:

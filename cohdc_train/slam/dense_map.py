@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.camera import Camera, maps_onto
 from cohdc_train.slam.culling import grow
 from cohdc_train.slam.optimization import Array, to_local
 from cohdc_train.slam.results import FrameRecord
@@ -36,7 +36,7 @@ class KeyframeImages:
     def __init__(self, camera: Camera, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
         self._index: list[tuple[float, int, int]] = []  # t, bytes of colour, bytes of depth
-        self._maps = _pinhole_maps(camera)
+        self._maps = maps_onto(camera, camera) if camera.distortion.any() else None
         self._units = _UNITS / camera.far  # per m
 
     def __enter__(self) -> Self:
@@ -70,16 +70,6 @@ class KeyframeImages:
                 bgr[..., ::-1],
                 np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32) / np.float32(self._units),
             )
-
-
-def _pinhole_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """What cv2.remap needs to take a lens's distortion out; None for a camera without."""
-    coefficients = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
-    if not coefficients.any():
-        return None
-    K, size = camera.matrix(), (camera.width, camera.height)
-    x, y = cv2.initUndistortRectifyMap(K, coefficients, None, K, size, cv2.CV_32FC1)
-    return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
 def unmasked(depth: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
@@ -135,7 +125,8 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
 def _rays(camera: Camera) -> Array:
     """[H, W, 3]: every pixel's direction, 1 m along the optical axis."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+    return camera.backproject(pixels, np.ones(u.size)).reshape(*u.shape, 3)
 
 
 def _evidence(points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Camera) -> NDArray[np.int32]:

@@ -14,6 +14,7 @@ from cohdc_train.slam.optimization import inverse, to_local
 
 SCALE = 1.2  # between two levels of the image pyramid
 LEVELS = 8
+_SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
 _CELL = 32  # px at the level of the corner
 _POOL = 2.0  # corners detected per corner kept: what the grid chooses from
 _ENOUGH = 1.6  # the same, below which the next threshold is tried
@@ -61,7 +62,6 @@ class FeatureExtractor:
         self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]
         self._latest = 0  # threshold that was low enough for the latest frame
         shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
-        self._scales = SCALE ** np.arange(LEVELS)
         self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
 
     def __call__(
@@ -83,7 +83,7 @@ class FeatureExtractor:
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
-        pixels += 0.5 * (self._scales[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
+        pixels += 0.5 * (_SCALES[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
         points = self.camera.undistort(pixels)
         depths = sample_depth(depth, pixels, mask)
         if lag is not None:
@@ -152,7 +152,7 @@ def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.i
     """
     best_first = np.argsort(-table[:, 3], kind="stable")
     octave = table[best_first, 2].astype(np.int64)
-    column, row = (table[best_first, :2].T // (_CELL * SCALE ** np.arange(LEVELS))[octave]).astype(np.int64)
+    column, row = (table[best_first, :2].T // (_CELL * _SCALES)[octave]).astype(np.int64)
     cell = (octave * 10_000 + row) * 10_000 + column
     order = np.argsort(cell, kind="stable")
     rank = np.empty(len(table), dtype=np.int64)

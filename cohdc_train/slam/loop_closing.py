@@ -57,7 +57,7 @@ class LoopCloser:
         if keyframe.index <= _RECENT:
             return []
         likeness = self._places.likeness(keyframe.features.descriptors)
-        shared = self._world.shared(keyframe.seen_points())[: keyframe.index]
+        shared = self._world.shared(keyframe.seen_points(), keyframes[: keyframe.index])
         near = shared >= _COVISIBLE
         least = _LIKENESS * float(np.median(likeness[near])) if near.any() else 0.0
         likeness[near] = 0.0

@@ -122,11 +122,11 @@ class Map:
         self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)
         self.moved[moving] = np.minimum(self.moved[moving] + _WENT, _CERTAIN)
 
-    def shared(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """[keyframes] how many of the points each keyframe sees."""
+    def shared(self, ids: NDArray[np.int64], keyframes: list[Keyframe]) -> NDArray[np.int64]:
+        """[keyframes] how many of the points each of them sees."""
         flags = np.zeros(self.size + 1, dtype=np.bool_)
         flags[ids] = True
-        return np.array([np.count_nonzero(flags[k.point_ids]) for k in self.keyframes])
+        return np.array([np.count_nonzero(flags[k.point_ids]) for k in keyframes], dtype=np.int64)
 
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
@@ -134,14 +134,12 @@ class Map:
         Only the 64 that occur most often among the points' latest observers are looked at, so that the time this takes
         does not grow with the map.
         """
-        flags = np.zeros(self.size + 1, dtype=np.bool_)
-        flags[ids] = True
         often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
         near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBOURS])
-        near = near[often[near] > 0]
-        shared = np.array([np.count_nonzero(flags[self.keyframes[i].point_ids]) for i in near], dtype=np.int64)
+        keyframes = [self.keyframes[i] for i in near if often[i] > 0]
+        shared = self.shared(ids, keyframes)
         order = np.argsort(-shared, kind="stable")[:limit]
-        return [self.keyframes[near[i]] for i in order if shared[i] > 0]
+        return [keyframes[i] for i in order if shared[i] > 0]
 
     def move_points(self, motions: Array) -> None:
         """Every point goes along with the keyframe it was born in. motions: [keyframes, 4, 4] of the world, m."""
@@ -181,8 +179,9 @@ class Map:
         self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
 
     def _reserve(self, count: int) -> None:
-        names = ("positions", "descriptors", "directions", "reach", "seen_by", "observers", "born", "visible", "found")
+        counters = ("seen_by", "observers", "born", "visible", "found", "moved")
+        names = ("positions", "descriptors", "directions", "reach", *counters)
         while len(self.positions) < count:
-            for name in (*names, "moved"):
+            for name in names:
                 array = getattr(self, name)
                 setattr(self, name, np.concatenate([array, np.zeros_like(array)]))

@@ -116,13 +116,13 @@ def residuals(local: Array, seen: Observations, weighing: Weighing) -> Array:
 def residual_jacobian(local: Array, seen: Observations, weighing: Weighing) -> Array:
     """d residuals / d local: [m, 3, 3], sigmas per m."""
     camera = weighing.camera
-    inverse = 1.0 / np.maximum(local[:, 2], _NEAR)
+    reciprocal = 1.0 / np.maximum(local[:, 2], _NEAR)
     result = np.zeros((len(local), 3, 3))
-    result[:, 0, 0] = camera.fx * inverse
-    result[:, 0, 2] = -camera.fx * local[:, 0] * inverse**2
-    result[:, 1, 1] = camera.fy * inverse
-    result[:, 1, 2] = -camera.fy * local[:, 1] * inverse**2
-    result[:, 2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf * inverse**2)
+    result[:, 0, 0] = camera.fx * reciprocal
+    result[:, 0, 2] = -camera.fx * local[:, 0] * reciprocal**2
+    result[:, 1, 1] = camera.fy * reciprocal
+    result[:, 1, 2] = -camera.fy * local[:, 1] * reciprocal**2
+    result[:, 2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf * reciprocal**2)
     result /= seen.sigmas[:, None, None]
     return result
 

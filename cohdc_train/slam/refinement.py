@@ -86,16 +86,14 @@ class Refiner:
         ids, corners = matches.points, matches.corners
         octaves = features.octaves[corners]
         A = affine(self.world, ids, T_cw)
-        inverse = np.linalg.inv(A) * (SCALE ** (octaves - self._octaves[ids]))[:, None, None]
-        template = warped(self._patches[ids], inverse, _SIDE + 2)
+        back = np.linalg.inv(A) * (SCALE ** (octaves - self._octaves[ids]))[:, None, None]
+        template = warped(self._patches[ids], back, _SIDE + 2)
         shift, good = align(pyramid, features.pixels[corners], octaves, template)
         rows = corners[good]
         pixels, points = features.pixels.copy(), features.points.copy()
         pixels[rows] += shift[good] * SCALE ** octaves[good, None]
-        undistort = self.world.camera.undistort
-        points[rows] += undistort(pixels[rows]) - undistort(
-            features.pixels[rows]
-        )  # they may be unrolled, see `shutter`
+        undistort = self.world.camera.undistort  # the difference, for points may be unrolled (`shutter`)
+        points[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
         return replace(features, pixels=pixels, points=points)
 
 

@@ -45,7 +45,7 @@ class StereoMatcher:
     def __init__(self, camera: Camera) -> None:
         if camera.baseline <= 0:
             raise DataError("a stereo camera's yaml needs baseline: m between the two cameras")
-        if any((camera.k1, camera.k2, camera.p1, camera.p2, camera.k3)) or not np.isclose(camera.fx, camera.fy):
+        if camera.distortion.any() or not np.isclose(camera.fx, camera.fy):
             raise DataError("a rectified stereo pair has fx = fy and no distortion: rectify the images first")
         self._Q = reprojection_matrix(camera)
         span = 16 * int(np.ceil(camera.width * _NEAREST_SHARE / 16))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.bundle_adjustment import Problem, adjust, measurement_chi2
 from cohdc_train.slam.map import Keyframe, Map, observations
-from cohdc_train.slam.optimization import Array, Observations, Weighing, to_local
+from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse, to_local
 
 WINDOW = 12  # keyframes in local bundle adjustment
 FIXED = 3  # of them hold still and carry the frame of reference
@@ -84,13 +84,12 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
     """
     if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=True)):
         return None
-    motion: Array = np.linalg.inv(window.poses[-1]) @ solution.poses[-1]
+    motion: Array = inverse(window.poses[-1]) @ solution.poses[-1]
     newest = window.keyframes[-1].index
     for later in world.keyframes[newest + 1 :]:
         later.T_cw = later.T_cw @ motion
     added = slice(window.size, world.size)
-    back = np.asarray(np.linalg.inv(motion), dtype=np.float64)
-    world.positions[added] = to_local(back, world.positions[added])
+    world.positions[added] = to_local(inverse(motion), world.positions[added])
     world.positions[window.ids] = solution.points
     for slot, member in enumerate(window.keyframes):
         member.T_cw = solution.poses[slot]
