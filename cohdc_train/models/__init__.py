@@ -1,6 +1,7 @@
 """The network: plain torch, no Lightning, no files, no configuration library."""
 
+from cohdc_train.models.fused import fused
 from cohdc_train.models.inference import Detector, detect
 from cohdc_train.models.mask_rcnn import MaskRCNN, NetworkConfig
 
-__all__ = ["Detector", "MaskRCNN", "NetworkConfig", "detect"]
+__all__ = ["Detector", "MaskRCNN", "NetworkConfig", "detect", "fused"]

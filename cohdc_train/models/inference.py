@@ -71,7 +71,8 @@ def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> Padd
     pyramid = network.features(canvas)
     limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
     proposals = _propose(network, list(pyramid.values()), limit)
-    levels = [pyramid[name] for name in network.config.roi_levels()]
+    # RoIAlign reads channels first, and would copy every level each time it is called
+    levels = [pyramid[name].contiguous() for name in network.config.roi_levels()]
     boxes, labels, scores, count = _classify(network, levels, proposals, limit)
     masks, quality = _segment(network, levels, boxes, labels, count)
     return PaddedDetections(boxes, labels, scores, quality, masks, count)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
-from cohdc_train.models import MaskRCNN, NetworkConfig, detect
+from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
 from cohdc_train.train.metrics import Results, SegmentationMetrics
 from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer
 
@@ -55,6 +55,7 @@ class MaskRCNNModule(pl.LightningModule):
         )
         self.network = MaskRCNN(len(self.class_names), self.network_config)
         self._metrics: SegmentationMetrics | None = None
+        self._fused: list[MaskRCNN] = []  # while validation lasts; in a list it is no part of the module
         self.results: Results | None = None  # of the last validation
 
     @classmethod
@@ -94,13 +95,15 @@ class MaskRCNNModule(pl.LightningModule):
         return total
 
     def on_validation_epoch_start(self) -> None:
-        """Begin new scores."""
+        """Begin new scores, of the weights as they are (the averaged ones, where they are scored)."""
+        # In bfloat16 channels last gained nothing (docs/results/training_speed.md).
+        self._fused = [fused(self.network, channels_last=self.trainer.precision == "32-true")]
         self._metrics = SegmentationMetrics(self._data().val_ground_truth(), self.rescore, self.min_quality)
 
     def validation_step(self, batch: list[ValSample], batch_idx: int) -> None:
         """Collect the detections of the batch's images."""
         assert self._metrics is not None
-        found = detect(self.network, [image for image, _ in batch])
+        found = detect(self._fused[0], [image for image, _ in batch])
         for (_, image_id), detections in zip(batch, found, strict=True):
             self._metrics.update(int(image_id), detections)
 
@@ -110,7 +113,7 @@ class MaskRCNNModule(pl.LightningModule):
         self.results = self._metrics.results()
         for name, value in self.results.scores.items():
             self.log(f"val/{name}", value, prog_bar=name == "segm_AP50", sync_dist=True)
-        self._metrics = None
+        self._metrics, self._fused = None, []
 
     def configure_optimizers(self) -> Any:
         """Optimizer over what is trained, and its schedule over the trainer's steps."""

@@ -1,0 +1,50 @@
+"""The copy that validation runs: the same detections, no norm left, and nothing of it in the network it was made of."""
+
+import pytest
+import torch
+from torch import nn
+
+from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
+from cohdc_train.models.staged import FrozenNorm
+
+SHAPES = {
+    "resnet18": {"depth": 18, "width": 0.25},
+    "resnet50": {"depth": 50, "width": 0.25},
+    "mobilenet_v1": {"backbone": "mobilenet_v1", "width": 0.25},
+    "mobilenet_v2": {"backbone": "mobilenet_v2", "width": 0.25},
+}
+
+
+def network_of(shape, norm):
+    torch.manual_seed(0)
+    small = {"canvas": (96, 128), "fpn_channels": 16, "fc": 32, "proposals": (50, 20), "detections": 10}
+    network = MaskRCNN(3, NetworkConfig(**SHAPES[shape], **small, norm=norm, score_threshold=0.0)).eval()
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d | FrozenNorm):
+            module.running_mean.uniform_(-0.5, 0.5)
+            module.running_var.uniform_(0.5, 2.0)
+            module.weight.data.uniform_(0.5, 1.5)
+            module.bias.data.uniform_(-0.5, 0.5)
+    return network
+
+
+@pytest.mark.parametrize("norm", ["batch", "frozen"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_it_finds_what_the_network_finds(shape, norm):
+    network = network_of(shape, norm)
+    images = [torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8), torch.zeros((3, 40, 90), dtype=torch.uint8)]
+    for channels_last in (True, False):
+        for ours, theirs in zip(detect(fused(network, channels_last), images), detect(network, images), strict=True):
+            assert len(theirs["boxes"]) > 0
+            for name in theirs:
+                torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_norm_is_folded_and_the_network_keeps_its_own(shape):
+    network = network_of(shape, "batch")
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    copied = fused(network)
+    assert not [m for m in copied.modules() if isinstance(m, nn.BatchNorm2d | FrozenNorm)]
+    assert not any(parameter.requires_grad for parameter in copied.parameters())
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
