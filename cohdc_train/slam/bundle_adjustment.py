@@ -1,9 +1,11 @@
-"""Local bundle adjustment: Levenberg-Marquardt over poses and points, points eliminated by the Schur complement."""
+"""Bundle adjustment: Levenberg-Marquardt over poses and points, points eliminated by the Schur complement."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from cohdc_train.slam.optimization import (
     Array,
@@ -14,10 +16,9 @@ from cohdc_train.slam.optimization import (
     pose_jacobian,
     residual_jacobian,
     residuals,
+    solve_symmetric,
     to_local,
 )
-
-_BLAS_SERIAL = 200_000  # multiplications; OpenBLAS starts threads at 262144
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class _Normal:
 
     camera: Array  # [c, 6, 6]
     point: Array  # [p, 3, 3]
-    mixed: Array  # [3, c * 6, p]: columns of the point's block first, so that products are long and contiguous
+    mixed: sparse.bsr_array  # [c * 6, p * 3]: a block of 6 x 3 for every measurement by a free camera
     camera_gradient: Array  # [c, 6]
     point_gradient: Array  # [p, 3]
 
@@ -116,34 +117,25 @@ def _normal_equations(poses: Array, points: Array, problem: Problem, weighing: W
         weight = np.sqrt(huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.limits))
         error, derivative = error * weight[:, None], derivative * weight[:, None, None]
     by_pose = pose_jacobian(local, derivative)
+    by_point = derivative @ poses[problem.cameras, :3, :3]
     free, count = np.flatnonzero(problem.free), len(points)
-    slot = {int(camera): place for place, camera in enumerate(free)}
-    result = _Normal(
-        camera=np.zeros((len(free), 6, 6)),
-        point=np.zeros((count, 3, 3)),
-        mixed=np.zeros((3, len(free) * 6, count)),
-        camera_gradient=np.zeros((len(free), 6)),
-        point_gradient=np.zeros((count, 3)),
-    )
+    camera, camera_gradient = np.zeros((len(free), 6, 6)), np.zeros((len(free), 6))
+    point, point_gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
     ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
-    for camera, pose in enumerate(poses):
-        rows = slice(ends[camera], ends[camera + 1])
-        by_point = (derivative[rows].reshape(-1, 3) @ pose[:3, :3]).reshape(-1, 3, 3)
-        ids = problem.points[rows]  # a camera sees a point once, so += may index with an array
-        result.point[ids] += by_point.transpose(0, 2, 1) @ by_point
-        result.point_gradient[ids] += np.einsum("mij,mi->mj", by_point, error[rows])
-        if camera in slot:
-            _add_camera(result, slot[camera], ids, (by_pose[rows], by_point, error[rows]))
-    return result
-
-
-def _add_camera(result: _Normal, slot: int, ids: NDArray[np.int64], terms: tuple[Array, Array, Array]) -> None:
-    by_pose, by_point, error = terms
-    J = by_pose.reshape(-1, 6)
-    result.camera[slot] = J.T @ J
-    result.camera_gradient[slot] = np.einsum("ma,m->a", J, error.reshape(-1))
-    products = by_pose.transpose(0, 2, 1) @ by_point
-    result.mixed[:, slot * 6 : slot * 6 + 6, ids] = products.transpose(2, 1, 0)
+    for rows in (slice(*pair) for pair in pairwise(ends)):
+        ids, J = problem.points[rows], by_point[rows]  # a camera sees a point once, so += may index with an array
+        point[ids] += J.transpose(0, 2, 1) @ J
+        point_gradient[ids] += np.einsum("mij,mi->mj", J, error[rows])
+    for slot, index in enumerate(free):
+        rows = slice(ends[index], ends[index + 1])
+        J = by_pose[rows].reshape(-1, 6)
+        camera[slot] = J.T @ J
+        camera_gradient[slot] = J.T @ error[rows].reshape(-1)
+    moves = problem.free[problem.cameras]
+    blocks = by_pose[moves].transpose(0, 2, 1) @ by_point[moves]
+    lengths = np.concatenate([[0], np.cumsum(np.diff(ends)[free])])
+    mixed = sparse.bsr_array((blocks, problem.points[moves], lengths), shape=(6 * len(free), 3 * count))
+    return _Normal(camera, point, mixed, camera_gradient, point_gradient)
 
 
 def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
@@ -153,29 +145,11 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     point = normal.point.copy()
     point[:, diagonal, diagonal] = point[:, diagonal, diagonal] * (1 + damping) + 1e-6
     inverse = np.linalg.inv(point)
-    right = -normal.camera_gradient.reshape(-1)
-    reduced = np.zeros((c * 6, c * 6))
-    for k in range(3):
-        carried = sum(mixed[i] * inverse[:, i, k] for i in range(3))  # column k of mixed @ inverse
-        reduced -= _product(carried, mixed[k])
-        right = right + np.einsum("ap,p->a", carried, normal.point_gradient[:, k])
-    for slot in range(c):
-        block = slice(slot * 6, slot * 6 + 6)
-        reduced[block, block] += normal.camera[slot] + damping * np.diag(np.diag(normal.camera[slot]))
-    reduced[np.diag_indices(c * 6)] += 1e-9
-    pose_step: Array = np.linalg.solve(reduced, right).astype(np.float64)
-    back = -normal.point_gradient - np.einsum("a,kap->pk", pose_step, mixed)
+    blocks = mixed.data @ inverse[mixed.indices]
+    carried = sparse.bsr_array((blocks, mixed.indices, mixed.indptr), shape=mixed.shape)
+    camera = normal.camera + (damping * normal.camera + 1e-9) * np.eye(6)
+    cameras = sparse.bsr_array((camera, np.arange(c), np.arange(c + 1)))
+    right = carried @ normal.point_gradient.ravel() - normal.camera_gradient.ravel()
+    pose_step = solve_symmetric(cameras - carried @ mixed.T, right)
+    back = -normal.point_gradient - (mixed.T @ pose_step).reshape(-1, 3)
     return pose_step.reshape(c, 6), np.einsum("pij,pj->pi", inverse, back)
-
-
-def _product(first: Array, second: Array) -> Array:
-    """first @ second.T of two [a, p] arrays, in pieces that a BLAS does not split over threads.
-
-    Waiting for a second thread on a busy machine costs many times these products, and the order of sums stays the same.
-    """
-    total = np.zeros((len(first), len(second)))
-    width = max(_BLAS_SERIAL // (len(first) * len(second)), 1)
-    for start in range(0, first.shape[1], width):
-        piece = slice(start, start + width)
-        total += first[:, piece] @ second[:, piece].T
-    return total

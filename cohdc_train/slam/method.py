@@ -13,9 +13,11 @@ class Method:
         geometry: what stands where a keyframe looked through moves, whatever its class; nothing is taken from there. A
             masked thing that has stood still for two seconds is of use until it moves.
         static_weights: groups of points that do not move with the rest are left out, and count less from then on.
+        global_adjustment: when the sequence is over, all keyframes are bundle-adjusted at once.
     """
 
     loops: bool = True
     refinement: bool = False
     geometry: bool = True
     static_weights: bool = True
+    global_adjustment: bool = True

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from cohdc_train.slam.camera import Camera
@@ -211,3 +213,10 @@ def _fill_pose_jacobian(J: Array, local: Array, seen: Observations, weighing: We
     J[4] = -x * J[2]
     J[4, 0] += z * u[0]
     J[5, 0], J[5, 1] = -y * u[0], x * v[1]
+
+
+def solve_symmetric(matrix: sparse.sparray | sparse.spmatrix, right: Array) -> Array:
+    """x of matrix @ x = right. matrix: sparse [n, n], symmetric and positive definite; right: [n]."""
+    options = {"SymmetricMode": True}
+    factors = splu(sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return np.asarray(factors.solve(right), dtype=np.float64)

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
-from cohdc_train.slam.optimization import Array, exp_se3, inverse, log_se3, skew
+from cohdc_train.slam.optimization import Array, exp_se3, inverse, log_se3, skew, solve_symmetric
 
 _ROUNDS = 6  # in which the kernel narrows
 _STEPS = 4  # per round
@@ -109,11 +108,10 @@ def _solve(poses: Array, edges: Edges, weights: Array, damping: float) -> Array:
     values = np.concatenate([block.ravel() for block in blocks])
     places = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
     J = sparse.csc_matrix((values, places), shape=(e * 6, n * 6))[:, 6:]
-    H = (J.T @ J).tocsc()
+    H = J.T @ J
     H += sparse.diags(damping * H.diagonal() + 1e-9, format="csc")
     right = -(J.T @ (edge_errors(poses, edges) * root).ravel())
-    factors = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.asarray(factors.solve(right), dtype=np.float64).reshape(-1, 6)
+    return solve_symmetric(H, right).reshape(-1, 6)
 
 
 def _adjoint(T: Array) -> Array:

@@ -23,6 +23,7 @@ from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse, log_se3
 from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.shutter import unrolled
+from cohdc_train.slam.window import adjust_everything
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
@@ -119,9 +120,11 @@ class Tracker:
         return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
 
     def finish(self) -> None:
-        """Wait for mapping that runs beside tracking; the trajectory is better for it."""
+        """Wait for mapping that runs beside tracking, and adjust the whole map; the trajectory is better for it."""
         if self._mapper is not None:
             self._mapper.finish(self.map)
+        if self.method.global_adjustment and len(self.map.keyframes) > 1:
+            adjust_everything(self.map, self._weighing)
 
     @property
     def loops(self) -> int:

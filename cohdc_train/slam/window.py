@@ -1,4 +1,4 @@
-"""Local bundle adjustment of a window of keyframes in three steps: the map's arrays out, the sums, the result back in.
+"""Bundle adjustment of keyframes, near the newest or all, in three steps: arrays out, the sums, the result back in.
 
 The middle step touches no map, so it may run elsewhere and later (`background_mapping`).
 """
@@ -46,7 +46,17 @@ def open_window(world: Map, keyframe: Keyframe) -> Window:
     """The keyframe with those that share most points, and their measurements."""
     keyframes = world.covisible(keyframe.seen_points(), WINDOW)
     keyframes.sort(key=lambda k: k.index)
-    fixed = max(1, min(FIXED, len(keyframes) // 4))
+    return _window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
+
+
+def adjust_everything(world: Map, weighing: Weighing) -> None:
+    """Bundle-adjust all keyframes and points at once; the first keyframe holds still."""
+    window = _window(world, list(world.keyframes), 1)
+    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))
+
+
+def _window(world: Map, keyframes: list[Keyframe], fixed: int) -> Window:
+    """Keyframes, the newest last, of which the first few are fixed, with all measurements of the others' points."""
     ids = world.points_of(keyframes[fixed:])
     row = np.full(world.size + 1, -1)
     row[ids] = np.arange(len(ids))

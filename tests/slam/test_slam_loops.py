@@ -1,5 +1,7 @@
 """A camera that walks round a hall and comes back, with loops and without."""
 
+import copy
+
 import numpy as np
 import pytest
 from loop_world import View, poor_view, way_round
@@ -11,6 +13,7 @@ from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Weighing, exp_se3, inverse
 from cohdc_train.slam.tracking import Pose, Tracker
 from cohdc_train.slam.verification import Loop, Verifier
+from cohdc_train.slam.window import adjust_everything
 from cohdc_train.trajectory import Trajectory, score
 
 FRAMES = 180
@@ -65,6 +68,33 @@ def test_both_ends_of_a_loop_share_points(closed: Run) -> None:
     assert all(len(ids) == len(np.unique(ids)) for ids in seen), "a keyframe sees a point once"
     counts = np.bincount(np.concatenate(seen), minlength=world.size)
     np.testing.assert_array_equal(world.seen_by[: world.size], counts)
+
+
+def test_adjusting_everything_brings_displaced_keyframes_back(closed: Run) -> None:
+    world = copy.deepcopy(closed[0].map)
+    adjust_everything(world, Weighing(CAMERA))
+    settled = np.stack([keyframe.T_cw for keyframe in world.keyframes])
+    rng = np.random.default_rng(0)
+    for keyframe in world.keyframes[1:]:
+        keyframe.T_cw = exp_se3(0.002 * rng.standard_normal(6)) @ keyframe.T_cw
+    displaced = np.stack([keyframe.T_cw for keyframe in world.keyframes])
+    adjust_everything(world, Weighing(CAMERA))
+    again = np.stack([keyframe.T_cw for keyframe in world.keyframes])
+    np.testing.assert_array_equal(again[0], settled[0])
+    assert np.abs(again - settled).mean() < 0.33 * np.abs(displaced - settled).mean()
+
+
+def test_the_end_of_a_run_adjusts_everything_unless_told_otherwise(views: list[View]) -> None:
+    poses = {}
+    for wanted in (True, False):
+        tracker = Tracker(CAMERA, features=250, method=Method(global_adjustment=wanted))
+        for index, (rgb, depth) in enumerate(views[:60]):
+            tracker.track(rgb, depth, index / 30)
+        before = tracker.trajectory()[1]
+        tracker.finish()
+        poses[wanted] = float(np.abs(tracker.trajectory()[1] - before).max())
+    assert poses[False] == 0.0
+    assert 0.0 < poses[True] < 0.05
 
 
 def test_same_views_same_bits(views: list[View], closed: Run) -> None:
