@@ -80,11 +80,11 @@ def test_other_code_drops_old_rows(tool: ModuleType, folder: Path, tmp_path: Pat
 
 
 def test_switches_of_the_method(tool: ModuleType) -> None:
-    assert tool.chosen(["loops=false"]).loops is False
+    assert tool.chosen_method(["loops=false"]).loops is False
     with pytest.raises(ValueError, match="'loop' is none of loops"):
-        tool.chosen(["loop=false"])
+        tool.chosen_method(["loop=false"])
     with pytest.raises(ValueError, match="'perhaps' is no bool"):
-        tool.chosen(["loops=perhaps"])
+        tool.chosen_method(["loops=perhaps"])
 
 
 def test_a_set_of_another_size_is_not_taken_for_this_one(tool: ModuleType, folder: Path) -> None:

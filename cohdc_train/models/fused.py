@@ -1,6 +1,7 @@
 """A network made faster for inference: norms folded into the convolutions before them, weights channels last."""
 
 import copy
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -22,8 +23,7 @@ def fused(network: MaskRCNN, channels_last: bool = True) -> MaskRCNN:
 
 
 def _fold(module: nn.Module) -> None:
-    children = list(module.named_children())
-    for (name, first), (norm_name, second) in zip(children, children[1:], strict=False):
+    for (name, first), (norm_name, second) in pairwise(list(module.named_children())):
         if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
             setattr(module, name, fuse_conv_bn_eval(first, second))  # type: ignore[type-var]
             setattr(module, norm_name, nn.Identity())

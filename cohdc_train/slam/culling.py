@@ -27,17 +27,21 @@ class Culling:
         score: detections below this class score are ignored.
         quality: detections below this CQE quality are ignored; the paper's filter is 0.9. A contour left out is a
             person left in: by default none is.
-        dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (2 - q).
+        dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (1 + doubt * (1 - q)).
+        doubt: how much more a contour grows that CQE trusts not at all; at 0 all grow alike.
     """
 
     dynamic_classes: list[str] | None = None
     score: float = 0.5
     quality: float = 0.0
     dilate: int = 10
+    doubt: float = 1.0
 
     def __post_init__(self) -> None:
         if self.dilate < 0:
             raise DataError(f"dilate is {self.dilate}; it cannot be below 0")
+        if not 0 <= self.doubt < float("inf"):
+            raise DataError(f"doubt is {self.doubt:g}; it cannot be below 0 or infinite")
         for name in ("score", "quality"):
             if not 0 <= getattr(self, name) <= 1:
                 raise DataError(f"{name} is {getattr(self, name):g}; it must lie within 0..1")
@@ -62,7 +66,7 @@ def _reach(places: NDArray[np.int64], radius: float) -> slice:
 
 
 def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Culling) -> Mask:
-    """The union of the dynamic objects' masks, each grown by dilate * (2 - quality) px.
+    """The union of the dynamic objects' masks, each grown by what `growth` says of its quality.
 
     A contour that CQE doubts gets a wider band instead of being left out, for a missed person costs more than lost
     corners.
@@ -83,7 +87,7 @@ def dynamic_objects(detections: Detections, labels: frozenset[int], culling: Cul
 
 def growth(culling: Culling, quality: float) -> float:
     """By how many px a contour of a CQE quality grows."""
-    return culling.dilate * (2.0 - min(max(quality, 0.0), 1.0))
+    return culling.dilate * (1.0 + culling.doubt * (1.0 - min(max(quality, 0.0), 1.0)))
 
 
 def no_masks(view: View) -> Mask | None:

@@ -86,6 +86,15 @@ def test_doubtful_contours_get_a_wider_band_and_are_never_dropped() -> None:
     assert not unsure[125, 78]
 
 
+def test_without_doubt_all_contours_grow_alike() -> None:
+    box = (100.0, 100.0, 150.0, 150.0)
+    masks = [
+        dynamic_mask(detections((box, 0, 0.9, quality)), frozenset([0]), Culling(dilate=10, doubt=0.0))
+        for quality in (0.0, 1.0)
+    ]
+    np.testing.assert_array_equal(*masks)
+
+
 def test_only_dynamic_classes_above_the_score_count() -> None:
     left, middle, right = (10.0, 10.0, 40.0, 40.0), (100.0, 10.0, 140.0, 40.0), (200.0, 10.0, 240.0, 40.0)
     found = detections((left, 0, 0.9, 1.0), (middle, 1, 0.9, 1.0), (right, 0, 0.3, 1.0))
@@ -124,7 +133,7 @@ def test_grow_is_a_disc() -> None:
     assert grow(mask, 0.0).sum() == 1
 
 
-@pytest.mark.parametrize("bad", [{"dilate": -1}, {"score": 1.5}])
+@pytest.mark.parametrize("bad", [{"dilate": -1}, {"score": 1.5}, {"doubt": -0.1}, {"doubt": float("nan")}])
 def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(DataError, match=next(iter(bad))):
         Culling(**bad)  # type: ignore[arg-type]
