@@ -14,6 +14,7 @@ from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import dynamic_mask_of
 from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.geometry import Geometry
+from cohdc_train.slam.keyframe_culling import cull_keyframes
 from cohdc_train.slam.localization import LOCAL_KEYFRAMES, Fit, Localizer, thumbnail
 from cohdc_train.slam.loop_closing import LoopCloser
 from cohdc_train.slam.map import Keyframe, Map
@@ -78,7 +79,7 @@ class Tracker:
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
-        self._log: list[tuple[float, Keyframe, Array]] = []  # stamp, reference keyframe, T of the frame in it
+        self._log: list[tuple[float, int, Array]] = []  # stamp, index of the reference keyframe, T of the frame in it
 
     def track(
         self,
@@ -112,6 +113,8 @@ class Tracker:
             fit = self._add_keyframe(features, fit, t, rgb, depth_m)
             if self._loops is not None:
                 fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
+            if self.method.keyframe_culling:
+                self._cull_keyframes()
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
@@ -129,12 +132,13 @@ class Tracker:
         return 0 if self._loops is None else self._loops.closed
 
     def trajectory(self) -> tuple[Array, Array]:
-        """All tracked frames, each re-derived from its reference keyframe as the map has it now.
+        """All tracked frames, each re-derived from its reference keyframe, or that one's heir, as the map has it now.
 
         Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
         """
         stamps = np.array([t for t, _, _ in self._log])
-        poses = [inverse(relative @ keyframe.T_cw) for _, keyframe, relative in self._log]
+        keyframes = {index: self.map.pose(index) for index in {index for _, index, _ in self._log}}
+        poses = [inverse(relative @ keyframes[index]) for _, index, relative in self._log]
         return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
 
     def _dynamic(
@@ -193,13 +197,20 @@ class Tracker:
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
         pictures = thumbnail(rgb), self._geometry.nearest(depth_m)
-        keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, *pictures)
+        keyframe = Keyframe(self.map.joined, t, fit.T_cw, features, point_ids, *pictures)
         insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
         if self._refiner is not None and pyramid is not None:
             self._refiner.remember(keyframe, pyramid)
         self._since_keyframe = 0
         self._reference_inliers = 0
         return _fit_of(keyframe)
+
+    def _cull_keyframes(self) -> None:
+        in_use = set() if self._mapper is None else self._mapper.busy_with
+        in_use |= set() if self._loops is None else self._loops.ends
+        for keyframe in cull_keyframes(self.map, self.map.keyframes[-1], in_use):
+            if self._loops is not None:
+                self._loops.forget(keyframe)
 
     def _close_loop(self, fit: Fit, loops: LoopCloser, picture: Picture) -> Fit:
         """The newest keyframe's fit; after a loop the last frame's pose goes along, so that the velocity stays."""
@@ -221,7 +232,7 @@ class Tracker:
         if self._since_keyframe > 0:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
-        self._log.append((t, fit.reference, fit.T_cw @ inverse(fit.reference.T_cw)))
+        self._log.append((t, fit.reference.index, fit.T_cw @ inverse(fit.reference.T_cw)))
 
 
 def _fit_of(keyframe: Keyframe) -> Fit:
