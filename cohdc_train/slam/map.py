@@ -136,7 +136,12 @@ class Map:
         keyframe.point_ids[corners] = -1
 
     def replace(self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
-        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point."""
+        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point.
+
+        The log-odds of having moved become the larger of both: the same frames have judged them, so that their sum
+        would count what a group did twice.
+        """
+        np.maximum.at(self.moved, new, self.moved[old])
         alias = np.arange(self.size + 1)
         alias[old] = new
         alias[-1] = -1
