@@ -75,7 +75,7 @@ class Tracker:
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
-        self._velocity = np.eye(4)
+        self._velocity = np.eye(4)  # T_cw of the last frame times the inverse of the one's before
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
@@ -101,11 +101,11 @@ class Tracker:
         mask = self.mask = self._dynamic(mask, depth_m, t)
         late = None if depth_t is None else depth_t - t
         features = self._corners(rgb, depth_m, mask, late)
-        fit = self._locate(features, rgb)
+        fit = self._locate(features, rgb, t)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
             features = self._corners(rgb, depth_m, None, late)
-            fit = self._locate(features, rgb)
+            fit = self._locate(features, rgb, t)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
@@ -148,7 +148,7 @@ class Tracker:
         if not self.method.geometry or self._last is None:
             return mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return dynamic_mask_of(self._geometry, mask, depth_m, self._velocity @ self._last.T_cw, around, t)
+        return dynamic_mask_of(self._geometry, mask, depth_m, self._motion(t) @ self._last.T_cw, around, t)
 
     def _corners(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
@@ -166,14 +166,26 @@ class Tracker:
         step = self._log[-1][0] - self._log[-2][0]
         return log_se3(self._velocity) / step if 0 < step <= _LONGEST else None
 
-    def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
+    def _motion(self, t: float) -> Array:
+        """[4, 4] T_cw to be expected at t times the inverse of the last one: constant velocity, however long it took.
+
+        After a pause the camera is held to have gone on for as long as its velocity is known to say something.
+        """
+        if len(self._log) < 2:
+            return self._velocity
+        last = self._log[-1][0]
+        step = last - self._log[-2][0]
+        share = min(t - last, max(step, _LONGEST)) / step if step > 0 else 1.0
+        return exp_se3(share * log_se3(self._velocity))
+
+    def _locate(self, features: Features, rgb: NDArray[np.uint8], t: float) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
             return Fit(np.eye(4), Matches(empty, empty)) if usable >= MIN_START else None
         if self._last is None:
             return self._localizer.anywhere(features, rgb)
-        return self._localizer.near(features, rgb, self._last, self._velocity)
+        return self._localizer.near(features, rgb, self._last, self._motion(t))
 
     def _take_in_mapping(self) -> None:
         """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
