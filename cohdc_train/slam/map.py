@@ -11,7 +11,7 @@ from cohdc_train.slam.matching import Matches, Projected
 from cohdc_train.slam.optimization import Array, Observations, inverse, to_local
 
 _NEAR = 0.1  # m
-_OBSERVERS = 8  # a point remembers the newest keyframes that see it
+_OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
 _NEIGHBOURS = 64  # keyframes that are looked at when those that share most points are sought
 _STILL = 3.0  # log-odds that a new point stands still
 _WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
@@ -175,7 +175,7 @@ class Map:
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
 
-        Only the 64 that occur most often among the points' newest observers are looked at, so that the time this takes
+        Only the 64 that occur most often among the points' observers are looked at, so that the time this takes
         does not grow with the map.
         """
         often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
@@ -186,7 +186,7 @@ class Map:
         return [keyframes[i] for i in order if shared[i] > 0]
 
     def observers_of(self, ids: NDArray[np.int64]) -> list[Keyframe]:
-        """The keyframes that see at least one of the points: of every point the newest eight."""
+        """The keyframes that see at least one of the points, of those that each point remembers."""
         return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
 
     def move(self, poses: Array) -> None:

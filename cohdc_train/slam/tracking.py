@@ -28,6 +28,9 @@ from cohdc_train.slam.shutter import unrolled
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
 _KEYFRAME_FRAMES = 20
+_OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
+_KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
+_KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
 
 
@@ -194,8 +197,11 @@ class Tracker:
             self._last = Fit(self._last.T_cw @ motion, self._last.matches)
 
     def _wants_keyframe(self, fit: Fit) -> bool:
-        if not self.map.keyframes:
+        if fit.reference is None:
             return True
+        old = self.map.born[: self.map.size] < self.map.joined - _OLD
+        if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
+            return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
         if self._since_keyframe >= _KEYFRAME_FRAMES:
             return True
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers

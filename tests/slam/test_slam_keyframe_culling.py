@@ -20,12 +20,13 @@ ROUNDS = 4
 PATH = camera_path(60)[::3]
 
 
-def sway(keyframe_culling: bool, rounds: int) -> Tracker:
+def sway(rounds: int, **parts: bool) -> Tracker:
     """A hand that sways before the room, every second frame a keyframe; the end of each round is its beginning."""
-    tracker = Tracker(CAMERA, features=250, method=Method(keyframe_culling=keyframe_culling))
+    tracker = Tracker(CAMERA, features=250, method=Method(**parts))
     views = [render(room(), T_wc)[:2] for T_wc in PATH]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 2)
+        patch.setattr("cohdc_train.slam.tracking._OLD", 1000)
         for number in range(rounds * ROUND):
             assert tracker.track(*views[number % ROUND], number / 30).tracked
     return tracker
@@ -33,12 +34,12 @@ def sway(keyframe_culling: bool, rounds: int) -> Tracker:
 
 @pytest.fixture(scope="module")
 def culled() -> Tracker:
-    return sway(True, ROUNDS)
+    return sway(ROUNDS)
 
 
 @pytest.fixture(scope="module")
 def never_culled() -> Tracker:
-    return sway(False, ROUNDS)
+    return sway(ROUNDS, keyframe_culling=False)
 
 
 @pytest.fixture
@@ -51,8 +52,33 @@ def whole(never_culled: Tracker, monkeypatch: pytest.MonkeyPatch) -> Tracker:
 def test_the_map_of_a_known_room_stops_growing(culled: Tracker, never_culled: Tracker) -> None:
     assert len(never_culled.map.keyframes) == never_culled.map.joined >= ROUNDS * ROUND / 2
     assert len(culled.map.keyframes) < 0.6 * len(never_culled.map.keyframes)
-    assert len(culled.map.keyframes) <= len(sway(True, ROUNDS - 2).map.keyframes) + 2
+    assert len(culled.map.keyframes) <= len(sway(ROUNDS - 2).map.keyframes) + 2
     assert ate(culled) < max(1.2 * ate(never_culled), 0.004)
+
+
+def test_patches_are_bounded_with_the_points() -> None:
+    """Refinement keeps one per row of the map; a point whose first keyframe has gone is still refined."""
+    tracker = sway(2, refinement=True)
+    assert tracker._refiner is not None
+    assert tracker.map.joined > len(tracker.map.keyframes)
+    assert len(tracker._refiner._patches) == len(tracker.map.positions)
+    assert len(tracker.trajectory()[0]) == 2 * ROUND
+
+
+def test_a_known_place_needs_no_keyframe() -> None:
+    """Twelve keyframes at one place, a hand that then holds still: at 30 frames/s the clock alone would ask for six."""
+    rgb, depth, _ = render(room(), PATH[0])
+    tracker = Tracker(CAMERA, features=250)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 1)
+        for number in range(12):
+            tracker.track(rgb, depth, number / 30)
+    later = [tracker.track(rgb, depth, (12 + number) / 30) for number in range(120)]
+    assert not any(pose.keyframe for pose in later)
+    views = [render(room(), exp_se3(np.array([0.03 * k, 0.0, 0.0, 0.0, 0.0, 0.0])))[:2] for k in range(30)]
+    aside = [tracker.track(*view, 5 + k / 30) for k, view in enumerate(views)]
+    assert all(pose.tracked for pose in aside)
+    assert any(pose.keyframe for pose in aside), "what comes into view beside it is taken into the map"
 
 
 def ate(tracker: Tracker) -> float:
