@@ -57,7 +57,8 @@ def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: li
 def _merge(world: Map, first: NDArray[np.int64], second: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
     near = np.linalg.norm(world.positions[first] - world.positions[second], axis=1) < 0.05
     first, second = first[near], second[near]
-    older = world.born[first] < world.born[second]
+    later = world.born[first] - world.born[second]
+    older = np.where(later == 0, first < second, later < 0)  # one order of all points, so that no two swap places
     old, new = np.where(older, second, first), np.where(older, first, second)
     chained = np.isin(new, old)  # a point that itself gives way this time waits for the next keyframe
     world.replace(old[~chained], new[~chained], keyframes)
