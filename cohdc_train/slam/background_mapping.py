@@ -30,6 +30,12 @@ class BackgroundMapper:
         self._running: tuple[Window, Future[Solution]] | None = None
         self._waiting: Keyframe | None = None
 
+    @property
+    def busy_with(self) -> set[int]:
+        """Indices of the keyframes that must stay in the map until `collect` has had them."""
+        waiting = set() if self._waiting is None else {self._waiting.index}
+        return waiting if self._running is None else waiting | {k.index for k in self._running[0].keyframes}
+
     def start(self, world: Map, keyframe: Keyframe) -> None:
         """Adjust the keyframe's window as soon as the one under way is done."""
         if self._running is not None:

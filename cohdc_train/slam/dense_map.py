@@ -102,7 +102,7 @@ def _nearest(depth: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[n
 def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, voxel: float) -> Cloud:
     """One point per cube of `voxel` m that at least two keyframes saw and that the others do not see through.
 
-    images: gone through twice; poses: t -> T_cw [4, 4] of the keyframes, m; frames without a pose are left out.
+    images: gone through twice; poses: t -> T_cw [4, 4] of frames, m; images without a pose are left out.
     """
     grid = VoxelGrid(voxel)
     rays = _rays(camera)

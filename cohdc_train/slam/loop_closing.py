@@ -31,18 +31,18 @@ class LoopCloser:
         self.closed = 0
         self._world, self._weighing = world, weighing
         self._places = Places(seed)
-        self._pictures: list[Picture] = []
+        self._pictures: dict[int, Picture] = {}  # of the keyframes in the map, by index
         self._loops: list[Loop] = []
         self._verify = Verifier(world, weighing, np.random.default_rng(seed))
 
     def close(self, keyframe: Keyframe, picture: Picture) -> bool:
-        """Look for a loop with the newest keyframe of the map, which must be given every keyframe once and in order.
+        """Look for a loop with the newest keyframe of the map; every one must be given once, when it has joined.
 
         Where one is found, all poses and points of the map move; returns whether that happened.
         """
-        self._pictures.append(picture)
+        self._pictures[keyframe.index] = picture
         candidates = self._candidates(keyframe)
-        self._places.add(keyframe.features.descriptors)
+        self._places.add(keyframe.index, keyframe.features.descriptors)
         for old in candidates:
             loop = self._verify(keyframe, old, self._pictures)
             if loop is not None and self._correct(loop):
@@ -51,37 +51,44 @@ class LoopCloser:
                 return True
         return False
 
+    def forget(self, keyframe: Keyframe) -> None:
+        """The map gave up a keyframe, which must not be one of `ends`."""
+        del self._pictures[keyframe.index]
+        self._places.remove(keyframe.index)
+
+    @property
+    def ends(self) -> set[int]:
+        """Indices of the keyframes that loops hold on to."""
+        return {index for loop in self._loops for index in (loop.old, *loop.new.tolist())}
+
     def _candidates(self, keyframe: Keyframe) -> list[Keyframe]:
         """Old keyframes that look like this one and share next to nothing with it."""
-        keyframes = self._world.keyframes
-        if keyframe.index <= _RECENT:
+        keyframes = self._world.keyframes[:-1]
+        if len(keyframes) <= _RECENT:
             return []
         likeness = self._places.likeness(keyframe.features.descriptors)
-        shared = self._world.shared(keyframe.seen_points(), keyframes[: keyframe.index])
+        shared = self._world.shared(keyframe.seen_points(), keyframes)
         near = shared >= _COVISIBLE
         least = _LIKENESS * float(np.median(likeness[near])) if near.any() else 0.0
         likeness[near] = 0.0
-        likeness[max(keyframe.index - _RECENT, 0) :] = 0.0
-        found: list[Keyframe] = []
-        for index in np.argsort(-likeness, kind="stable"):
-            if likeness[index] <= least or len(found) == _CANDIDATES:
+        likeness[-_RECENT:] = 0.0
+        found: list[int] = []
+        for place in np.argsort(-likeness, kind="stable").tolist():
+            if likeness[place] <= least or len(found) == _CANDIDATES:
                 break
-            if all(abs(int(index) - k.index) >= _APART for k in found):
-                found.append(keyframes[index])
-        return found
+            if all(abs(place - other) >= _APART for other in found):
+                found.append(place)
+        return [keyframes[place] for place in found]
 
     def _correct(self, loop: Loop) -> bool:
         """Optimise the graph with the new loop and move the map, unless the graph refuses the loop."""
         edges = self._edges(loop)
-        keyframes = self._world.keyframes
-        before = np.stack([k.T_cw for k in keyframes])
+        before = np.stack([k.T_cw for k in self._world.keyframes])
         after, weights = optimize_graph(before, edges)
         if weights[-len(loop.new)] < _TRUST:
             return False
         self._loops.append(loop)
-        for keyframe, T_cw in zip(keyframes, after, strict=True):
-            keyframe.T_cw = T_cw
-        self._world.move_points(inverse(after) @ before)
+        self._world.move(after)
         return True
 
     def _edges(self, newest: Loop) -> Edges:
@@ -89,8 +96,9 @@ class LoopCloser:
         poses = np.stack([k.T_cw for k in self._world.keyframes])
         first, second, shared = _graph_pairs(_shared_points(self._world))
         loops = [*self._loops, newest]
-        old = np.concatenate([np.full(len(loop.new), loop.old) for loop in loops])
-        new = np.concatenate([loop.new for loop in loops])
+        row = {keyframe.index: i for i, keyframe in enumerate(self._world.keyframes)}
+        old = np.concatenate([np.full(len(loop.new), row[loop.old]) for loop in loops])
+        new = np.array([row[index] for loop in loops for index in loop.new.tolist()])
         scale = np.sqrt(_SHARED / np.clip(shared, 10, 400))
         return Edges(
             np.concatenate([first, old]),
@@ -103,8 +111,8 @@ class LoopCloser:
     def _join(self, loop: Loop) -> None:
         """Make the points one that both ends of the loop have, and adjust around the newest keyframe."""
         world = self._world
-        keyframe = world.keyframes[int(loop.new[0])]
-        place = world.covisible(world.keyframes[loop.old].seen_points(), _FUSE)
+        keyframe = world.keyframes[-1]
+        place = world.covisible(world.anchor(loop.old)[0].seen_points(), _FUSE)
         for here in world.covisible(keyframe.seen_points(), _FUSE):
             fuse_into(world, world.points_of(place), here, world.keyframes)
         adjust_window(world, keyframe, self._weighing)

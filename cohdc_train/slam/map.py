@@ -8,23 +8,23 @@ from numpy.typing import NDArray
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.features import LEVELS, SCALE, Features
 from cohdc_train.slam.matching import Matches, Projected
-from cohdc_train.slam.optimization import Array, Observations, to_local
+from cohdc_train.slam.optimization import Array, Observations, inverse, to_local
 
 _NEAR = 0.1  # m
-_OBSERVERS = 8  # a point remembers by which keyframes it was seen last
+_OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
 _NEIGHBOURS = 64  # keyframes that are looked at when those that share most points are sought
 _STILL = 3.0  # log-odds that a new point stands still
 _WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
 _VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
 
 
-@dataclass
+@dataclass(eq=False)
 class Keyframe:
     """A frame the map keeps.
 
-    index: place in the map's list; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n] int64, the map point of every
-    corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the place again; nearest: [h, w]
-    coarse depth as Geometry.nearest gives it, m.
+    index: its number, Map.joined when it joins, not used again; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n]
+    int64, the map point of every corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the
+    place again; nearest: [h, w] coarse depth as Geometry.nearest gives it, m.
     """
 
     index: int
@@ -50,11 +50,18 @@ def observations(features: Features, corners: NDArray[np.int64], trust: Array | 
 
 
 class Map:
-    """Points live in arrays that grow by doubling; an id is a row and is never reused."""
+    """Points live in arrays that grow by doubling; an id is a row, which a new point takes when no keyframe sees the
+    one in it any more.
+
+    keyframes: those that are in the map, index rising; joined: how many ever were.
+    """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self.keyframes: list[Keyframe] = []
+        self.joined = 0
+        self._by_index: dict[int, Keyframe] = {}
+        self._heirs: dict[int, tuple[int, Array]] = {}  # of removed keyframes: whom each hangs on, and by what
         self.size = 0
         self.positions = np.zeros((1024, 3))
         self.descriptors = np.zeros((1024, 4), dtype=np.uint64)
@@ -70,19 +77,49 @@ class Map:
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
         self.keyframes.append(keyframe)
+        self._by_index[keyframe.index] = keyframe
+        self.joined = keyframe.index + 1
         self._add_observer(keyframe.seen_points(), keyframe)
+
+    def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:
+        """Take out a keyframe; what hung on it, frames and points, hangs on another from now on, where it is now.
+
+        The directions its points were seen from stay known.
+        """
+        self.forget(keyframe, np.flatnonzero(keyframe.point_ids >= 0))
+        self.keyframes.remove(keyframe)
+        del self._by_index[keyframe.index]
+        self._heirs[keyframe.index] = heir.index, keyframe.T_cw @ inverse(heir.T_cw)
+
+    def anchor(self, index: int) -> tuple[Keyframe, Array]:
+        """What a keyframe that joined once hangs on: itself, or the heir of a removed one; and [4, 4] from the heir's
+        camera to its own, m."""
+        T = np.eye(4)
+        while index not in self._by_index:
+            index, step = self._heirs[index]
+            T = T @ step
+        return self._by_index[index], T
+
+    def pose(self, index: int) -> Array:
+        """T_cw [4, 4], m, of a keyframe that joined once."""
+        keyframe, T = self.anchor(index)
+        return np.asarray(T @ keyframe.T_cw)
+
+    def way(self) -> Array:
+        """[joined, 4, 4] T_wc, m, of all keyframes, removed ones too."""
+        return inverse(np.stack([self.pose(index) for index in range(self.joined)]))
 
     def add_points(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
         """New points at the depth that was measured at corners of a keyframe."""
         features, count = keyframe.features, len(corners)
-        self._reserve(self.size + count)
-        ids = np.arange(self.size, self.size + count)
-        self.size += count
+        ids = self._free_rows(count)
         local = self.camera.backproject(features.points[corners], features.depths[corners])
         self.positions[ids] = (local - keyframe.T_cw[:3, 3]) @ keyframe.T_cw[:3, :3]
         self.descriptors[ids] = features.descriptors[corners]
         self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[corners]
         self.born[ids] = keyframe.index
+        self.directions[ids] = 0.0
+        self.moved[ids] = 0.0
         self.visible[ids] = self.found[ids] = 1
         self.observe(keyframe, Matches(ids, corners))
 
@@ -93,11 +130,18 @@ class Map:
 
     def forget(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
         """Corners of a keyframe are no measurements of their points."""
-        np.subtract.at(self.seen_by, keyframe.point_ids[corners], 1)
+        ids = keyframe.point_ids[corners]
+        np.subtract.at(self.seen_by, ids, 1)
+        self.observers[ids] = np.where(self.observers[ids] == keyframe.index + 1, 0, self.observers[ids])
         keyframe.point_ids[corners] = -1
 
     def replace(self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
-        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point."""
+        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point.
+
+        The log-odds of having moved become the larger of both: the same frames have judged them, so that their sum
+        would count what a group did twice.
+        """
+        np.maximum.at(self.moved, new, self.moved[old])
         alias = np.arange(self.size + 1)
         alias[old] = new
         alias[-1] = -1
@@ -131,19 +175,28 @@ class Map:
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
 
-        Only the 64 that occur most often among the points' latest observers are looked at, so that the time this takes
+        Only the 64 that occur most often among the points' observers are looked at, so that the time this takes
         does not grow with the map.
         """
         often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
         near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBOURS])
-        keyframes = [self.keyframes[i] for i in near if often[i] > 0]
+        keyframes = [self._by_index[i] for i in near.tolist() if often[i] > 0]
         shared = self.shared(ids, keyframes)
         order = np.argsort(-shared, kind="stable")[:limit]
         return [keyframes[i] for i in order if shared[i] > 0]
 
-    def move_points(self, motions: Array) -> None:
-        """Every point goes along with the keyframe it was born in. motions: [keyframes, 4, 4] of the world, m."""
-        motion = motions[self.born[: self.size]]
+    def observers_of(self, ids: NDArray[np.int64]) -> list[Keyframe]:
+        """The keyframes that see at least one of the points, of those that each point remembers."""
+        return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
+
+    def move(self, poses: Array) -> None:
+        """Keyframes go to poses [keyframes, 4, 4] T_cw, m, and every point goes along with the one it was born in."""
+        motions = inverse(poses) @ np.stack([k.T_cw for k in self.keyframes])
+        row = {keyframe.index: i for i, keyframe in enumerate(self.keyframes)}
+        born, which = np.unique(self.born[: self.size], return_inverse=True)
+        motion = motions[[row[self.anchor(index)[0].index] for index in born.tolist()]][which]
+        for keyframe, T_cw in zip(self.keyframes, poses, strict=True):
+            keyframe.T_cw = T_cw
         moved = np.einsum("nij,nj->ni", motion[:, :3, :3], self.positions[: self.size])
         self.positions[: self.size] = moved + motion[:, :3, 3]
         self.directions[: self.size] = np.einsum("nij,nj->ni", motion[:, :3, :3], self.directions[: self.size])
@@ -173,10 +226,19 @@ class Map:
         return Projected(ids[seen], pixels, levels, self.descriptors[ids[seen]])
 
     def _add_observer(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
-        self.observers[ids, self.seen_by[ids] % _OBSERVERS] = keyframe.index + 1
+        self.observers[ids, self.observers[ids].argmin(axis=1)] = keyframe.index + 1  # a free place, or the oldest's
         self.seen_by[ids] += 1
         offset = self.positions[ids] - keyframe.centre()
         self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
+
+    def _free_rows(self, count: int) -> NDArray[np.int64]:
+        """Rows that hold no point, those of former points first."""
+        free = np.flatnonzero(self.seen_by[: self.size] == 0)[:count]
+        end = self.size + count - len(free)
+        ids = np.concatenate([free, np.arange(self.size, end)])
+        self._reserve(end)
+        self.size = end
+        return ids
 
     def _reserve(self, count: int) -> None:
         counters = ("seen_by", "observers", "born", "visible", "found", "moved")

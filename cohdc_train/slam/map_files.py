@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cohdc_train.files import write_bytes
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dense_map import KeyframeImages, fuse
+from cohdc_train.slam.optimization import inverse
 from cohdc_train.slam.ply import write_ply
 from cohdc_train.slam.results import FrameRecord
 from cohdc_train.slam.source import View
@@ -45,11 +46,11 @@ class MapFiles:
         """Write the files, with keyframes and points where the map has them now."""
         cloud = self._colours.cloud(tracker.map)
         write_ply(self._folder / "map.ply", cloud.points, cloud.colours)
+        stamps, poses = tracker.trajectory()
         if self._images is not None:
-            keyframes = {keyframe.t: keyframe.T_cw for keyframe in tracker.map.keyframes}
-            cloud = fuse(self._images, keyframes, tracker.camera, _VOXEL)
+            frames = dict(zip(stamps.tolist(), inverse(poses), strict=True))  # with keyframes that left the map
+            cloud = fuse(self._images, frames, tracker.camera, _VOXEL)
             write_ply(self._folder / "cloud.ply", cloud.points, cloud.colours)
-        poses = tracker.trajectory()[1]
         if len(poses):
             picture = cv2.cvtColor(from_above(cloud, list(poses)), cv2.COLOR_RGB2BGR)
             write_bytes(self._folder / "map.png", cv2.imencode(".png", picture)[1].tobytes())

@@ -7,7 +7,7 @@ from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import match_projected
 from cohdc_train.slam.optimization import Weighing
-from cohdc_train.slam.window import WINDOW, close_window, open_window, solve
+from cohdc_train.slam.window import close_window, open_window, solve
 
 _FUSE_KEYFRAMES = 8
 _TRIAL = 3  # keyframes after which a point must have proved itself
@@ -56,7 +56,10 @@ def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: li
 
 def _merge(world: Map, first: NDArray[np.int64], second: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
     near = np.linalg.norm(world.positions[first] - world.positions[second], axis=1) < 0.05
-    old, new = np.maximum(first, second)[near], np.minimum(first, second)[near]
+    first, second = first[near], second[near]
+    later = world.born[first] - world.born[second]
+    older = np.where(later == 0, first < second, later < 0)  # one order of all points, so that no two swap places
+    old, new = np.where(older, second, first), np.where(older, first, second)
     chained = np.isin(new, old)  # a point that itself gives way this time waits for the next keyframe
     world.replace(old[~chained], new[~chained], keyframes)
 
@@ -72,7 +75,12 @@ def cull(world: Map, newest: int) -> None:
     young = np.flatnonzero((world.born[: world.size] >= newest - _TRIAL) & (world.seen_by[: world.size] > 0))
     weak = (world.born[young] == newest - _TRIAL) & (world.seen_by[young] < _MIN_SEEN_BY)
     weak |= world.found[young] < _MIN_FOUND * world.visible[young]
+    drop_points(world, young[weak])
+
+
+def drop_points(world: Map, ids: NDArray[np.int64]) -> None:
+    """No keyframe sees these points any more."""
     drop = np.zeros(world.size + 1, dtype=np.bool_)
-    drop[young[weak]] = True
-    for keyframe in world.keyframes[max(newest - 2 * WINDOW, 0) :]:
+    drop[ids] = True
+    for keyframe in world.observers_of(ids):
         world.forget(keyframe, np.flatnonzero(drop[keyframe.point_ids]))

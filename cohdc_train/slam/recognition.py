@@ -18,21 +18,26 @@ class Places:
         rng = np.random.default_rng(seed)
         self._bits = np.stack([rng.choice(256, _BITS, replace=False) for _ in range(_TABLES)])
         self._holders = np.zeros(_TABLES << _BITS, dtype=np.int32)  # keyframes per hash
-        self._hashes: list[NDArray[np.int64]] = []
+        self._hashes: dict[int, NDArray[np.int64]] = {}
 
-    def add(self, descriptors: NDArray[np.uint64]) -> None:
+    def add(self, index: int, descriptors: NDArray[np.uint64]) -> None:
         """The next keyframe. descriptors: [n, 4]."""
         hashes = self._hash(descriptors)
         self._holders[hashes] += 1
-        self._hashes.append(hashes)
+        self._hashes[index] = hashes
+
+    def remove(self, index: int) -> None:
+        """Take out a keyframe."""
+        self._holders[self._hashes.pop(index)] -= 1
 
     def likeness(self, descriptors: NDArray[np.uint64]) -> NDArray[np.float64]:
-        """descriptors: [n, 4]. Returns [keyframes] 0..1, the weighed share of the hashes that each one has too."""
+        """descriptors: [n, 4]. Returns [keyframes] 0..1, the weighed share of the hashes that each one has too, in the
+        order they were added."""
         hashes = self._hash(descriptors)
         weight = np.zeros(_TABLES << _BITS, dtype=np.float32)
         weight[hashes] = np.log((len(self._hashes) + 1) / np.maximum(self._holders[hashes], 1))
         total = float(weight[hashes].sum())
-        votes = np.array([float(weight[held].sum()) for held in self._hashes])
+        votes = np.array([float(weight[held].sum()) for held in self._hashes.values()])
         return votes / max(total, 1e-9)
 
     def _hash(self, descriptors: NDArray[np.uint64]) -> NDArray[np.int64]:

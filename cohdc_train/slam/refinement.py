@@ -69,9 +69,10 @@ class Refiner:
 
     def remember(self, keyframe: Keyframe, pyramid: Pyramid) -> None:
         """Cut out the points that were born in a keyframe, which must be in the map."""
-        grown = self.world.size - len(self._patches)
-        self._patches = np.concatenate([self._patches, np.zeros((grown, _STORED, _STORED), dtype=np.uint8)])
-        self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
+        grown = len(self.world.positions) - len(self._patches)  # the map doubles its arrays, so this is rarely copied
+        if grown > 0:
+            self._patches = np.concatenate([self._patches, np.zeros((grown, _STORED, _STORED), dtype=np.uint8)])
+            self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
         corners = np.flatnonzero(keyframe.point_ids >= 0)
         corners = corners[self.world.born[keyframe.point_ids[corners]] == keyframe.index]
         ids, octaves = keyframe.point_ids[corners], keyframe.features.octaves[corners]
@@ -107,7 +108,8 @@ def square(side: int) -> Array:
 def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
     """A of eq. 9 for n points: [n, 2, 2] px of a camera at T_cw per px of the keyframe where each was first seen."""
     camera, points = world.camera, world.positions[ids]
-    T_bw = np.stack([world.keyframes[index].T_cw for index in world.born[ids]])
+    born, which = np.unique(world.born[ids], return_inverse=True)
+    T_bw = np.stack([world.pose(index) for index in born.tolist()])[which]
     depth = np.einsum("nj,nj->n", T_bw[:, 2, :3], points) + T_bw[:, 2, 3]  # in the keyframe of its birth
     local = to_local(T_cw, points)
     across = T_cw[:3, :3] @ T_bw[:, :2, :3].transpose(0, 2, 1)  # [n, 3, 2] that keyframe's x and y axes

@@ -134,6 +134,7 @@ def run_source(
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops, "without_depth": source.without_depth}
+        metrics["keyframes_in_map"] = len(tracker.map.keyframes)
         metrics |= measure(records, trajectory, truth, beside.source.dropped if beside else 0)
         metrics |= beside.metrics() if beside else {}
         write_run(part, records, trajectory, metrics, config)
@@ -146,7 +147,7 @@ def summary(metrics: dict[str, Any]) -> str:
     """The small table at the end of a run."""
     rows = [
         ("frames", f"{metrics['tracked']} of {metrics['frames']} tracked ({100 * metrics['coverage']:.1f} %)"),
-        ("keyframes", str(metrics["keyframes"])),
+        ("keyframes", f"{metrics['keyframes']}, {metrics['keyframes_in_map']} of them in the map at the end"),
         ("loops closed", str(metrics["loops"])),
         ("frames/s", f"{metrics['fps']:.1f}"),
     ]

@@ -32,16 +32,18 @@ class Cloud:
 
 
 class PointColours:
-    """Watches a run and keeps the colours of every keyframe's corners (some 3 kB each), for the points they become."""
+    """Watches a run and keeps the colours of the map's keyframes' corners (some 3 kB each), for the points they are."""
 
     def __init__(self) -> None:
         self._colours: dict[float, NDArray[np.uint8]] = {}  # t of a keyframe -> [corners, 3] RGB
 
     def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
-        """Note the colours when the frame became a keyframe."""
+        """Note the colours when the frame became a keyframe, and forget those of keyframes that left the map."""
         if record.pose.keyframe and tracker.features is not None:
             columns, rows = np.rint(tracker.features.pixels).astype(np.int64).T
             self._colours[view.t] = view.rgb[rows, columns]
+            there = {keyframe.t for keyframe in tracker.map.keyframes}
+            self._colours = {t: colours for t, colours in self._colours.items() if t in there}
 
     def cloud(self, world: Map) -> Cloud:
         """The points that at least three keyframes see (all of them, in a map of fewer), in the last one's colours."""

@@ -14,6 +14,7 @@ from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import dynamic_mask_of
 from cohdc_train.slam.features import FeatureExtractor, Features
 from cohdc_train.slam.geometry import Geometry
+from cohdc_train.slam.keyframe_culling import cull_keyframes
 from cohdc_train.slam.localization import LOCAL_KEYFRAMES, Fit, Localizer, thumbnail
 from cohdc_train.slam.loop_closing import LoopCloser
 from cohdc_train.slam.map import Keyframe, Map
@@ -28,6 +29,9 @@ from cohdc_train.slam.window import adjust_everything
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
 _KEYFRAME_FRAMES = 20
+_OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
+_KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
+_KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
 
 
@@ -75,11 +79,11 @@ class Tracker:
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
-        self._velocity = np.eye(4)
+        self._velocity = np.eye(4)  # T_cw of the last frame times the inverse of the one's before
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
-        self._log: list[tuple[float, Keyframe, Array]] = []  # stamp, reference keyframe, T of the frame in it
+        self._log: list[tuple[float, int, Array]] = []  # stamp, index of the reference keyframe, T of the frame in it
 
     def track(
         self,
@@ -101,11 +105,11 @@ class Tracker:
         mask = self.mask = self._dynamic(mask, depth_m, t)
         late = None if depth_t is None else depth_t - t
         features = self._corners(rgb, depth_m, mask, late)
-        fit = self._locate(features, rgb)
+        fit = self._locate(features, rgb, t)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
             features = self._corners(rgb, depth_m, None, late)
-            fit = self._locate(features, rgb)
+            fit = self._locate(features, rgb, t)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
@@ -113,6 +117,8 @@ class Tracker:
             fit = self._add_keyframe(features, fit, t, rgb, depth_m)
             if self._loops is not None:
                 fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
+            if self.method.keyframe_culling:
+                self._cull_keyframes()
         self._remember(fit, t)
         inliers = 0 if fit is None else len(fit.matches)
         mapped = time.perf_counter()
@@ -132,12 +138,13 @@ class Tracker:
         return 0 if self._loops is None else self._loops.closed
 
     def trajectory(self) -> tuple[Array, Array]:
-        """All tracked frames, each re-derived from its reference keyframe as the map has it now.
+        """All tracked frames, each re-derived from its reference keyframe, or that one's heir, as the map has it now.
 
         Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
         """
         stamps = np.array([t for t, _, _ in self._log])
-        poses = [inverse(relative @ keyframe.T_cw) for _, keyframe, relative in self._log]
+        keyframes = {index: self.map.pose(index) for index in {index for _, index, _ in self._log}}
+        poses = [inverse(relative @ keyframes[index]) for _, index, relative in self._log]
         return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
 
     def _dynamic(
@@ -147,7 +154,7 @@ class Tracker:
         if not self.method.geometry or self._last is None:
             return mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return dynamic_mask_of(self._geometry, mask, depth_m, self._velocity @ self._last.T_cw, around, t)
+        return dynamic_mask_of(self._geometry, mask, depth_m, self._motion(t) @ self._last.T_cw, around, t)
 
     def _corners(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
@@ -165,14 +172,26 @@ class Tracker:
         step = self._log[-1][0] - self._log[-2][0]
         return log_se3(self._velocity) / step if 0 < step <= _LONGEST else None
 
-    def _locate(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
+    def _motion(self, t: float) -> Array:
+        """[4, 4] T_cw to be expected at t times the inverse of the last one: constant velocity, however long it took.
+
+        After a pause the camera is held to have gone on for as long as its velocity is known to say something.
+        """
+        if len(self._log) < 2:
+            return self._velocity
+        last = self._log[-1][0]
+        step = last - self._log[-2][0]
+        share = min(t - last, max(step, _LONGEST)) / step if step > 0 else 1.0
+        return exp_se3(share * log_se3(self._velocity))
+
+    def _locate(self, features: Features, rgb: NDArray[np.uint8], t: float) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
             return Fit(np.eye(4), Matches(empty, empty)) if usable >= MIN_START else None
         if self._last is None:
             return self._localizer.anywhere(features, rgb)
-        return self._localizer.near(features, rgb, self._last, self._velocity)
+        return self._localizer.near(features, rgb, self._last, self._motion(t))
 
     def _take_in_mapping(self) -> None:
         """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
@@ -181,8 +200,11 @@ class Tracker:
             self._last = Fit(self._last.T_cw @ motion, self._last.matches)
 
     def _wants_keyframe(self, fit: Fit) -> bool:
-        if not self.map.keyframes:
+        if fit.reference is None:
             return True
+        old = self.map.born[: self.map.size] < self.map.joined - _OLD
+        if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
+            return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
         if self._since_keyframe >= _KEYFRAME_FRAMES:
             return True
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
@@ -196,13 +218,20 @@ class Tracker:
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
         pictures = thumbnail(rgb), self._geometry.nearest(depth_m)
-        keyframe = Keyframe(len(self.map.keyframes), t, fit.T_cw, features, point_ids, *pictures)
+        keyframe = Keyframe(self.map.joined, t, fit.T_cw, features, point_ids, *pictures)
         insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
         if self._refiner is not None and pyramid is not None:
             self._refiner.remember(keyframe, pyramid)
         self._since_keyframe = 0
         self._reference_inliers = 0
         return _fit_of(keyframe)
+
+    def _cull_keyframes(self) -> None:
+        in_use = set() if self._mapper is None else self._mapper.busy_with
+        in_use |= set() if self._loops is None else self._loops.ends
+        for keyframe in cull_keyframes(self.map, self.map.keyframes[-1], in_use):
+            if self._loops is not None:
+                self._loops.forget(keyframe)
 
     def _close_loop(self, fit: Fit, loops: LoopCloser, picture: Picture) -> Fit:
         """The newest keyframe's fit; after a loop the last frame's pose goes along, so that the velocity stays."""
@@ -224,7 +253,7 @@ class Tracker:
         if self._since_keyframe > 0:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
-        self._log.append((t, fit.reference, fit.T_cw @ inverse(fit.reference.T_cw)))
+        self._log.append((t, fit.reference.index, fit.T_cw @ inverse(fit.reference.T_cw)))
 
 
 def _fit_of(keyframe: Keyframe) -> Fit:

@@ -1,5 +1,6 @@
 """Is this the place seen before? Asked of the geometry of points, of neighbours and of the pictures themselves."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,8 +46,8 @@ class Verifier:
     def __init__(self, world: Map, weighing: Weighing, rng: np.random.Generator) -> None:
         self._world, self._weighing, self._rng = world, weighing, rng
 
-    def __call__(self, keyframe: Keyframe, old: Keyframe, pictures: list[Picture]) -> Loop | None:
-        """The loop between a keyframe and an old one, or None. pictures: of all keyframes."""
+    def __call__(self, keyframe: Keyframe, old: Keyframe, pictures: Mapping[int, Picture]) -> Loop | None:
+        """The loop between a keyframe and an old one, or None. pictures: of both, by index."""
         ids = old.seen_points()
         place = self._world.points_of(self._world.covisible(ids, _PLACE))
         T_cw = self._locate(keyframe, ids, place)

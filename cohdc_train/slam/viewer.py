@@ -124,5 +124,4 @@ class Viewer:
         if pose.keyframe:
             cloud = self._colours.cloud(tracker.map)
             log("world/points", rerun.Points3D(cloud.points, colors=cloud.colours, radii=0.006))
-            centres = np.stack([keyframe.centre() for keyframe in tracker.map.keyframes])
-            log("world/way", rerun.LineStrips3D([centres], colors=[_WAY]))
+            log("world/way", rerun.LineStrips3D([tracker.map.way()[:, :3, 3]], colors=[_WAY]))

@@ -21,7 +21,7 @@ class Window:
     """What a bundle adjustment starts from.
 
     keyframes: [c] the newest last; poses: [c, 4, 4] T_cw, m, as they were; ids: [p] map points; points: [p, 3] world,
-    m, as they were; problem: m measurements; corners: [m] the keyframe's corner behind each; size: of the map then.
+    m, as they were; problem: m measurements; corners: [m] the keyframe's corner behind each.
     """
 
     keyframes: list[Keyframe]
@@ -30,7 +30,6 @@ class Window:
     points: Array
     problem: Problem
     corners: NDArray[np.int64]
-    size: int
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def _window(world: Map, keyframes: list[Keyframe], fixed: int) -> Window:
         free=np.arange(len(keyframes)) >= fixed,
     )
     poses = [k.T_cw for k in keyframes]
-    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(corners), world.size)
+    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(corners))
 
 
 def solve(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Solution:
@@ -88,7 +87,8 @@ def solve(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> 
 def close_window(world: Map, window: Window, solution: Solution) -> Array | None:
     """Put a solution into the map; measurements that do not fit are dropped.
 
-    The map may have grown since the window was opened: what was added moves along with the window's newest keyframe.
+    The map may have changed since the window was opened: what was added moves along with the window's newest keyframe.
+    No keyframe of the window may have been removed.
     Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and nothing is done, when
     somebody else moved one of the keyframes in the meantime (a loop was closed).
     """
@@ -96,11 +96,12 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
         return None
     motion: Array = inverse(window.poses[-1]) @ solution.poses[-1]
     newest = window.keyframes[-1].index
-    for later in world.keyframes[newest + 1 :]:
+    for later in [k for k in world.keyframes if k.index > newest]:
         later.T_cw = later.T_cw @ motion
-    added = slice(window.size, world.size)
+    added = np.flatnonzero(world.born[: world.size] > newest)
     world.positions[added] = to_local(inverse(motion), world.positions[added])
-    world.positions[window.ids] = solution.points
+    same = world.born[window.ids] <= newest  # a younger point may have taken the row of one that is gone
+    world.positions[window.ids[same]] = solution.points[same]
     for slot, member in enumerate(window.keyframes):
         member.T_cw = solution.poses[slot]
         rows = (window.problem.cameras == slot) & ~solution.good

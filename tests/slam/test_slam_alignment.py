@@ -98,8 +98,8 @@ def test_a_place_is_recognised_among_others() -> None:
     rng, extract = np.random.default_rng(0), FeatureExtractor(CAMERA, 300)
     poses = way_round(24, turns=0.95)
     places = Places()
-    for pose in poses:
-        places.add(extract(*poor_view(pose, rng)).descriptors)
+    for number, pose in enumerate(poses):
+        places.add(number, extract(*poor_view(pose, rng)).descriptors)
     nudge = exp_se3(np.array([0.05, 0.02, -0.05, 0.01, 0.03, 0.02]))
     for index in (3, 20):
         likeness = places.likeness(extract(*poor_view(poses[index] @ nudge, rng)).descriptors)
@@ -107,3 +107,7 @@ def test_a_place_is_recognised_among_others() -> None:
         assert np.argmax(likeness) == index
         apart = np.delete(likeness, range(max(index - 3, 0), index + 4))
         assert likeness[index] > 3 * apart.max()
+    for number in range(3):
+        places.remove(number)
+    there = extract(*poor_view(poses[20] @ nudge, rng)).descriptors
+    assert np.argmax(places.likeness(there)) == 17, "the others move up, as the map's do"

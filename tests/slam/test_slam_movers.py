@@ -206,6 +206,19 @@ def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() 
     np.testing.assert_array_equal(world.trust(ids), 1)
 
 
+def test_what_is_known_of_a_duplicate_stays_known_when_it_is_joined() -> None:
+    """Two corners of a mover, seen as two points, of which one has been caught moving."""
+    tracker = Tracker(CAMERA, features=200)
+    tracker.track(*render(room(), STILL)[:2], 0.0)
+    world = tracker.map
+    for moving in ([7, 12], [12]):
+        world.judge(still=np.zeros(0, dtype=np.int64), moving=np.array(moving))
+    caught = world.trust(np.array([7, 12]))
+    assert caught[1] < caught[0] < 1
+    world.replace(np.array([7, 9, 11]), np.array([3, 12, 3]), world.keyframes)
+    np.testing.assert_array_equal(world.trust(np.array([3, 12, 4])), [*caught, 1])
+
+
 def test_depth_that_comes_late_is_carried_back() -> None:
     """The camera nears the wall by 3 cm before depth is taken, and turns."""
     lag = np.linalg.inv(exp_se3(np.array([0.01, 0.0, 0.03, 0.0, 0.02, 0.0])))

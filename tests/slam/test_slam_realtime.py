@@ -155,7 +155,7 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
     window = open_window(world, newest)
     later = replace(
         newest,
-        index=len(world.keyframes),
+        index=world.joined,
         T_cw=exp_se3(np.array([0.1, 0, 0, 0, 0.1, 0])) @ newest.T_cw,
         features=features,
         point_ids=np.full(len(features), -1),
@@ -164,7 +164,9 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
     world.add_points(later, np.flatnonzero(features.depths > 0)[:20])
     step = exp_se3(np.array([0.02, -0.01, 0.03, 0.01, 0.02, 0.005]))
     between = later.T_cw @ np.linalg.inv(newest.T_cw)
-    seen = to_local(later.T_cw, world.positions[world.size - 20 : world.size])
+    added = later.seen_points()
+    assert len(added) == 20
+    seen = to_local(later.T_cw, world.positions[added])
     good = np.ones(len(window.corners), dtype=np.bool_)
     good[-30:] = False
     before = np.count_nonzero(newest.point_ids >= 0)
@@ -172,7 +174,7 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
     assert motion is not None
     np.testing.assert_allclose(newest.T_cw, step @ window.poses[-1])
     np.testing.assert_allclose(later.T_cw @ np.linalg.inv(newest.T_cw), between, atol=1e-9)
-    np.testing.assert_allclose(to_local(later.T_cw, world.positions[world.size - 20 : world.size]), seen, atol=1e-9)
+    np.testing.assert_allclose(to_local(later.T_cw, world.positions[added]), seen, atol=1e-9)
     assert np.count_nonzero(newest.point_ids >= 0) == before - 30, "measurements that do not fit are forgotten"
     assert close_window(world, window, Solution(np.stack(window.poses), window.points, good)) is None, (
         "a solution for poses that somebody else has moved since is of no use"

@@ -7,6 +7,7 @@ from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam.features import Features
 from cohdc_train.slam.matching import Matches, Projected, match_projected, one_to_one
+from cohdc_train.slam.optimization import exp_se3, inverse
 from cohdc_train.slam.tracking import Pose, Tracker
 from cohdc_train.trajectory import Trajectory, score
 
@@ -59,6 +60,22 @@ def test_the_place_is_found_again_after_a_black_out(views: list[View]) -> None:
     stamps, _ = tracker.trajectory()
     assert len(stamps) == 33, "lost frames have no pose"
     assert ate(tracker, path) < 0.005
+
+
+def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five are missing, in which the wall moves by 72 px: no place is looked up, for the motion says where to look."""
+    path = exp_se3(np.outer(np.arange(13) - 5, [0.12, 0.0, 0.01, 0.0, 0.01, 0.0]))
+    tracker = Tracker(CAMERA, features=500)
+
+    def lost(*_: object) -> None:
+        raise AssertionError("the whole map is searched")
+
+    monkeypatch.setattr(tracker._localizer, "anywhere", lost)
+    for k in [*range(4), *range(9, 13)]:
+        pose = tracker.track(*render(room(), path[k])[:2], k / 30)
+        assert pose.T_wc is not None
+        assert np.linalg.norm((inverse(path[0]) @ path[k] @ inverse(pose.T_wc))[:3, 3]) < 0.015
+        assert pose.inliers > 200
 
 
 def test_nothing_to_see_is_lost_not_guessed() -> None:
