@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
 from operator import attrgetter
 
 import cv2
@@ -112,7 +111,8 @@ class FeatureExtractor:
     ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float64]]:
         """Corners above the highest threshold that leaves enough, and the table of them that `spread` takes.
 
-        Which threshold was tried first, the latest frame's, makes no difference to that.
+        Which threshold was tried first, the latest frame's, makes no difference to that: ORB's own order, which depends
+        on it and would decide between corners of one response, gives way to level, row and column.
         """
         enough = _ENOUGH * self.budget
         for k in range(self._latest, len(_THRESHOLDS)):
@@ -123,9 +123,10 @@ class FeatureExtractor:
         while k > 0 and np.count_nonzero(responses >= _THRESHOLDS[k - 1]) >= enough:
             k -= 1
         self._latest = k
-        strong = responses >= _THRESHOLDS[k]
-        found = list(compress(found, strong))
-        return found, np.column_stack([*_places(found), responses[strong]])
+        places, octaves = _places(found)
+        order = np.lexsort((places[:, 0], places[:, 1], octaves))
+        order = order[responses[order] >= _THRESHOLDS[k]]
+        return [found[i] for i in order], np.column_stack([places, octaves, responses])[order]
 
 
 def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

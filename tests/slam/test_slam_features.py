@@ -39,6 +39,19 @@ def test_corners_spread_over_cells_and_levels() -> None:
     assert chosen[chosen >= 308].tolist() == [309]
 
 
+def test_no_earlier_frame_decides_which_corners_are_chosen() -> None:
+    rng = np.random.default_rng(0)
+    tiles = rng.integers(0, 2, size=(15, 20))
+    squares = np.kron(tiles, np.ones((16, 16)))  # corners of two grey levels: responses are alike
+    rgb = np.repeat((80 + 90 * squares)[..., None], 3, axis=2).astype(np.uint8)
+    depth = np.full((240, 320), 2.0, dtype=np.float32)
+    fresh, used = FeatureExtractor(CAMERA, 100), FeatureExtractor(CAMERA, 100)
+    used(np.full_like(rgb, 90), depth)  # a picture without corners: the next one is sought with the lowest threshold
+    first, second = fresh(rgb, depth), used(rgb, depth)
+    np.testing.assert_array_equal(first.pixels, second.pixels)
+    np.testing.assert_array_equal(first.octaves, second.octaves)
+
+
 def test_depth_is_refused_beside_edges_and_masks() -> None:
     depth = np.full((240, 320), 2.0, dtype=np.float32)
     depth[:, 100:] = 3.0
