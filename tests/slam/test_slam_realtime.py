@@ -21,6 +21,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.slam.async_masks import AsyncMasks
 from cohdc_train.slam.background_mapping import worker_process
 from cohdc_train.slam.culling import Mask
+from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import exp_se3, to_local
 from cohdc_train.slam.source import View
 from cohdc_train.slam.tracking import Tracker
@@ -120,7 +121,7 @@ def run_late() -> tuple[Tracker, list[bool], list[float]]:
     worlds = [[*room(), passer_by(index)] for index in range(FRAMES)]
     rendered = [render(world, T_wc) for world, T_wc in zip(worlds, camera_path(FRAMES), strict=True)]
     segmenter = Segmenter(lambda view: rendered[int(view.name)][2])
-    tracker = Tracker(CAMERA, features=500, executor=Late())
+    tracker = Tracker(CAMERA, features=500, method=Method(global_adjustment=False), executor=Late())
     tracked, overlaps = [], []
     segmenter.allowed.release()
     with AsyncMasks(segmenter) as masks:
