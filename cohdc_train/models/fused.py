@@ -19,11 +19,11 @@ def fused(network: MaskRCNN, channels_last: bool = True) -> MaskRCNN:
     copied = copy.deepcopy(network).eval().requires_grad_(False)
     for module in list(copied.modules()):
         _fold(module)
-    return copied.to(memory_format=torch.channels_last) if channels_last else copied  # type: ignore[call-overload]
+    return copied.to(memory_format=torch.channels_last) if channels_last else copied
 
 
 def _fold(module: nn.Module) -> None:
     for (name, first), (norm_name, second) in pairwise(list(module.named_children())):
         if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
-            setattr(module, name, fuse_conv_bn_eval(first, second))  # type: ignore[type-var]
+            setattr(module, name, fuse_conv_bn_eval(first, second))  # type: ignore[arg-type]
             setattr(module, norm_name, nn.Identity())
