@@ -65,6 +65,7 @@ def test_patches_are_bounded_with_the_points() -> None:
     assert len(tracker.trajectory()[0]) == 2 * ROUND
 
 
+@pytest.mark.slow
 def test_a_known_place_needs_no_keyframe() -> None:
     """Twelve keyframes at one place, a hand that then holds still: at 30 frames/s the clock alone would ask for six."""
     rgb, depth, _ = render(room(), PATH[0])

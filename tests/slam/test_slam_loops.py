@@ -97,6 +97,7 @@ def test_the_end_of_a_run_adjusts_everything_unless_told_otherwise(views: list[V
     assert 0.0 < poses[True] < 0.05
 
 
+@pytest.mark.slow
 def test_same_views_same_bits(views: list[View], closed: Run) -> None:
     again, _ = run(views, loops=True)
     assert again.trajectory()[1].tobytes() == closed[0].trajectory()[1].tobytes()

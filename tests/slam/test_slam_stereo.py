@@ -76,6 +76,7 @@ def test_depth_of_a_pair_is_the_true_depth() -> None:
     assert np.mean(disparity_error > 1) < 0.05
 
 
+@pytest.mark.slow
 def test_a_stereo_sequence_is_tracked(tmp_path: Path) -> None:
     sequence = write_stereo(tmp_path / "pair", 30, with_passer_by=True)
     words = ["slam", "--sequence", str(sequence), "--masks", str(sequence / "masks"), "--out", str(tmp_path / "run")]
