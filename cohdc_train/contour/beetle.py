@@ -48,7 +48,7 @@ def search_vertices(finer: list[Polygon], iou_floor: float, coverage: Coverage, 
     beetles = _Beetles(finer, coverage, search.pairs)
     best, failed = finer, 0
     while failed < search.tries and (fewer := beetles.without(failed)) is not None:
-        if fewer.settle(iou_floor, search, rng) and coverage.keep(fewer.polygons(), iou_floor):
+        if fewer.settle(iou_floor, search, rng) and coverage.valid(fewer.polygons()):
             beetles, best, failed = fewer, fewer.polygons(), 0
         else:
             failed += 1
@@ -141,7 +141,7 @@ class _Beetles:
 
     def iou(self) -> float:
         """With the outline, 0..1, as long as no ring crosses itself."""
-        return self._coverage.ratio(*self._coverage.between(self._x, self._x[self._after]))
+        return self._coverage.iou_of(self._x, self._x[self._after])
 
     def polygons(self) -> list[Polygon]:
         """What the beetles stand around."""
