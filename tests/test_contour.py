@@ -193,7 +193,7 @@ def test_difference_of_edges_is_what_a_moved_vertex_changes(seed: int) -> None:
     coverage, rng = Coverage(trace(mask)), np.random.default_rng(seed)
     low, high = coverage.low, coverage.high
     a, b = (coverage.nearest(low + (high - low) * share) for share in ([0, 0.5], [1, 0.5]))
-    heads = coverage.nearest(rng.uniform(low + [0, (high - low)[1] / 2], high, (5, 2)))
+    heads = coverage.nearest(rng.uniform((low[0], (low[1] + high[1]) / 2), high, (5, 2)))
     apart = [(rasterize([Polygon(np.array([a, b, head]))], SIZE) ^ mask).sum() for head in heads]
     turn = -1 if cv2.contourArea(trace(mask)[0].outer.astype(np.float32), oriented=True) < 0 else 1
     start, end = np.repeat(b[None], 5, 0), np.repeat(a[None], 5, 0)

@@ -76,9 +76,10 @@ class Coverage:
 
     def nearest(self, points: FloatArray) -> FloatArray:
         """Points [..., 2] moved onto the GRID and into the outline's bounds."""
-        local = np.round((points - self.low) / GRID) * GRID
-        placed: FloatArray = self.low + np.clip(local, 0, self.high - self.low)
-        return placed
+        placed: FloatArray = np.rint((points - self.low) / GRID)
+        placed *= GRID
+        placed += self.low
+        return np.minimum(np.maximum(placed, self.low, out=placed), self.high, out=placed)
 
     def valid(self, polygons: Sequence[Polygon]) -> bool:
         """Whether no ring crosses another or itself, and all turn as the outline's do: holes against outer rings."""
