@@ -11,7 +11,6 @@ from cohdc_train.contour.polygons import FloatArray, IntArray, Polygon, vertices
 _MOST_VERTICES = 2000  # behind bisection; an outline of more is kept as it is
 _DENSE = 10  # of an outline with many vertices one of so many is tried before the search ends
 _ROOM = 0.35  # of the shorter of its edges: further no vertex moves at a time
-_HOPE = 1.5  # moves to come are not worth more than so many times the last two together
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ class _Beetles:
         for k, step in enumerate(search.steps):
             if ious[-1] >= iou_floor:
                 return True
-            if k > 2 and ious[-1] + _HOPE * (ious[-1] - ious[-3]) < iou_floor:
+            if k > 1 and 2 * ious[-1] - ious[-3] < iou_floor:  # moves to come are worth less than the last two
                 return False
             self.move(step, step / search.c, k, rng)
             ious.append(self.iou())
