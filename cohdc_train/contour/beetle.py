@@ -168,7 +168,7 @@ class _Beetles:
             np.concatenate([x, x[self._before]]), np.concatenate([x[self._after], x[self._after]])
         ).reshape(2, -1)
         missed = (across - around - around[self._before]).astype(np.float64)
-        for ring in np.flatnonzero(self._sizes == 3):
+        for ring in np.flatnonzero(self._sizes == 3).tolist():
             start, end = ends[ring] - 3, ends[ring]
             missed[start] = -around[start:end].sum() / 3 if self._spare(ring) else np.inf
             missed[start + 1 : end] = np.inf

@@ -63,8 +63,8 @@ class Coverage:
         inside = np.bitwise_xor.accumulate(hits) & 1
         alone = np.arange(len(hits), dtype=np.int32)
         alone[1:] -= 2 * np.cumsum(inside[:-1], dtype=np.int32)
-        alone = alone.reshape(self._width, self._rows)
-        signed: NDArray[np.int32] = ((alone - alone[:, :1]) * self._sign).ravel()
+        columns = alone.reshape(self._width, self._rows)
+        signed: NDArray[np.int32] = ((columns - columns[:, :1]) * self._sign).ravel()
         return signed
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:

@@ -38,7 +38,7 @@ def simplify(
     reached. `dp` is plain Douglas-Peucker with a fixed tolerance, which knows no floor.
 
     But for `dp`, rings of a result do not cross themselves or each other; where a coarser one would, the finer one
-    stays. Parts and holes too small to keep three vertices vanish where the floor allows it.
+    stays. Small parts and holes vanish where the floor allows it.
 
     Args:
         polygons: as `trace` gives them.
