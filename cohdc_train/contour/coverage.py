@@ -23,8 +23,8 @@ class Coverage:
     def __init__(self, polygons: Sequence[Polygon]) -> None:
         rings = [ring for polygon in polygons for ring in polygon.rings]
         start, end = edges(rings)
-        x, y = np.ascontiguousarray(start.T)
-        self.low, self.high = np.floor([x.min(), y.min()]), np.ceil([x.max(), y.max()])
+        axes = np.ascontiguousarray(start.T)
+        self.low, self.high = np.floor(axes.min(1)), np.ceil(axes.max(1))
         self._first_centre = self.low + CENTRE
         self._width, height = (self.high - self.low).astype(int).tolist()
         self._rows = height + 1  # places in a column

@@ -83,6 +83,9 @@ def _fill(rings: Sequence[FloatArray], size: tuple[int, int]) -> NDArray[np.bool
 
 def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Where the edges of all rings begin and end: two [E, 2], px. There is a ring at least."""
+    if len(rings) == 1:
+        (ring,) = rings
+        return ring, np.concatenate((ring[1:], ring[:1]))
     return np.concatenate(rings), np.concatenate([part for ring in rings for part in (ring[1:], ring[:1])])
 
 
@@ -114,7 +117,7 @@ def crossings(start: FloatArray, end: FloatArray, width: int | None = None) -> C
     first = counts.cumsum()
     first -= counts
     column = (np.minimum(left, right) - first).repeat(counts)
-    column += np.arange(len(column))
+    column += np.arange(len(column), dtype=np.float64)
     slope = d[:, 1] / (dx + (dx == 0))
     row = slope.repeat(counts)
     row *= column
