@@ -39,8 +39,11 @@ class Coverage:
 
     def iou_of(self, start: FloatArray, end: FloatArray) -> float:
         """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
-        places = np.sort(self._crossed(start, end)[0])
-        covered, apart = _enclosed(places), _enclosed(np.sort(np.concatenate([self._places, places])))
+        places = self._crossed(start, end)[0]
+        both = np.concatenate((self._places, places))
+        places.sort()
+        both.sort()
+        covered, apart = _enclosed(places), _enclosed(both)
         return (self.area + covered - apart) / (self.area + covered + apart)
 
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
@@ -91,7 +94,7 @@ class Coverage:
 
 def _enclosed(places: FloatArray) -> int:
     """Pixels between places in order."""
-    return int(np.add.reduce(places[1::2]) - np.add.reduce(places[::2]))
+    return int((places[1::2] - places[::2]).sum())
 
 
 def _turn(ring: FloatArray) -> int:
@@ -109,9 +112,7 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
     """
     if not rings:
         return False
-    points = np.array(edges(rings))
-    points *= 10
-    np.rint(points, out=points)
+    points = np.rint(10 * np.array(edges(rings))).view(np.complex128)[..., 0]
     blocks = [points[:, i : i + _BLOCK] for i in range(0, points.shape[1], _BLOCK)]
     for k, block in enumerate(blocks):
         for other in blocks[k:]:
@@ -121,12 +122,9 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
     return False
 
 
-def _parted(edges: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
-    """Whether the lines through edges [2, m, 2] have the ends of others [2, n, 2] on different sides: [m, n]."""
-    (ax, ay), (bx, by) = edges.transpose(0, 2, 1)[..., None]
-    ux, uy = bx - ax, by - ay
-    sides = others[:, None, :, 1] * ux
-    sides -= others[:, None, :, 0] * uy
-    sides -= ux * ay - uy * ax
+def _parted(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> NDArray[np.bool_]:
+    """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different sides: [m, n]."""
+    start, along = edges[0, :, None], edges[1, :, None] - edges[0, :, None]
+    sides = ((others[:, None] - start) * along.conj()).imag
     parted: NDArray[np.bool_] = sides[0] * sides[1] < 0
     return parted
