@@ -82,7 +82,9 @@ class Coverage:
         placed: FloatArray = np.rint((points - self.low) / GRID)
         placed *= GRID
         placed += self.low
-        return np.minimum(np.maximum(placed, self.low, out=placed), self.high, out=placed)
+        np.maximum(placed, self.low, out=placed)
+        np.minimum(placed, self.high, out=placed)
+        return placed
 
     def valid(self, polygons: Sequence[Polygon]) -> bool:
         """Whether no ring crosses another or itself, and all turn as the outline's do: holes against outer rings."""
