@@ -175,13 +175,31 @@ def test_crossing_tells_a_bow_tie_from_a_square_and_touching_from_crossing() -> 
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_coverage_by_edges_is_coverage_by_filling(seed: int) -> None:
+def test_coverage_by_crossings_is_coverage_by_filling(seed: int) -> None:
+    """Of rings that cross themselves too."""
     mask = blob(seed)
-    polygons = trace(mask)
-    coarser = simplify(polygons, method="dp", epsilon=3)
-    rings = [ring for polygon in coarser for ring in polygon.rings]
-    if not cross_somewhere(rings):
-        assert Coverage(polygons).iou(coarser) == pytest.approx(iou(rasterize(coarser, SIZE), mask), abs=1e-12)
+    coverage, rng = Coverage(polygons := trace(mask)), np.random.default_rng(seed)
+    low, high = coverage.low, coverage.high
+    tangled = [Polygon(rng.uniform(low, high, (7, 2))) for _ in range(2)]
+    for coarser in (simplify(polygons, method="dp", epsilon=3), tangled):
+        assert coverage.iou(coarser) == iou(rasterize(coarser, SIZE), mask)
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_difference_of_edges_is_what_a_moved_vertex_changes(seed: int) -> None:
+    """The pixels that only one of outline and polygon has, counted by filling."""
+    mask = blob(seed)
+    coverage, rng = Coverage(trace(mask)), np.random.default_rng(seed)
+    low, high = coverage.low, coverage.high
+    a, b = (coverage.nearest(low + (high - low) * share) for share in ([0, 0.5], [1, 0.5]))
+    heads = coverage.nearest(rng.uniform((low[0], (low[1] + high[1]) / 2), high, (5, 2)))
+    apart = [(rasterize([Polygon(np.array([a, b, head]))], SIZE) ^ mask).sum() for head in heads]
+    turn = -1 if cv2.contourArea(trace(mask)[0].outer.astype(np.float32), oriented=True) < 0 else 1
+    start, end = np.repeat(b[None], 5, 0), np.repeat(a[None], 5, 0)
+    assert cv2.contourArea(np.array([a, b, high], np.float32), oriented=True) > 0
+    added = coverage.difference(start, heads) + coverage.difference(heads, end)
+    assert np.array_equal(turn * (added - added[0]), np.subtract(apart, apart[0]))
 
 
 @given(SEEDS)
@@ -240,13 +258,22 @@ def test_a_huge_mask_is_traced_and_simplified() -> None:
     assert view.any()
 
 
-def test_a_ring_turned_inside_out_covers_nothing() -> None:
+def test_a_ring_turned_inside_out_is_not_valid() -> None:
     mask = np.zeros((4, 4), bool)
     mask[:, 0] = mask[3] = True
     coverage = Coverage(trace(mask))
     (outline,) = trace(mask)
-    assert coverage.iou([outline]) == 1
-    assert coverage.iou([Polygon(outline.outer[::-1])]) == 0
+    assert coverage.valid([outline])
+    assert not coverage.valid([Polygon(outline.outer[::-1])])
+
+
+def test_a_hole_must_turn_against_its_outer_ring() -> None:
+    mask = np.ones((6, 6), bool)
+    mask[2:4, 1:5] = False
+    (outline,) = trace(mask)
+    coverage = Coverage([outline])
+    assert coverage.valid([outline])
+    assert not coverage.valid([Polygon(outline.outer, (outline.holes[0][::-1],))])
 
 
 @given(SEEDS, st.sampled_from([0.5, 0.8]))

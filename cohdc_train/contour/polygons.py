@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-_TIE = 1e-7  # px; an edge that near a pixel's centre goes through it, wherever the grid begins
+CENTRE = np.array([0.5, 0.5 + 1e-7])  # px; an edge that near a pixel's centre goes through it, wherever the grid begins
 
 
 @dataclass(frozen=True)
@@ -73,35 +74,55 @@ def _fill(rings: Sequence[FloatArray], size: tuple[int, int]) -> NDArray[np.bool
     if not rings:
         return np.zeros(size, np.bool_)
     start, end = edges(rings)
-    _, row, column, _ = crossings(start, end, size)
-    hits = np.bincount(row * width + column, minlength=(height + 1) * width).reshape(height + 1, width)
+    met = crossings(start - CENTRE, end - CENTRE, width)
+    place = met.row.clip(0, height) * width + met.column
+    hits = np.bincount(place.astype(np.int64), minlength=(height + 1) * width).reshape(height + 1, width)
     odd = np.bitwise_xor.accumulate(hits[:height].astype(np.uint8), axis=0) & 1
     return odd.view(np.bool_)
 
 
 def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Where the edges of all rings begin and end: two [E, 2], px. There is a ring at least."""
+    if len(rings) == 1:
+        (ring,) = rings
+        return ring, np.concatenate((ring[1:], ring[:1]))
     return np.concatenate(rings), np.concatenate([part for ring in rings for part in (ring[1:], ring[:1])])
 
 
-def crossings(
-    start: FloatArray, end: FloatArray, size: tuple[int, int]
-) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Where edges cross the centre lines of a grid's columns.
+class Crossings(NamedTuple):
+    """Where E edges cross the centre lines of a grid's columns, N times, edge after edge.
 
-    start, end: [E, 2] px; size: (height, width). Returns the edge of each crossing, the row (0..height) of the first
-    pixel centre below it, its column, and +1 where the edge goes to the right, -1 where it goes to the left.
+    column, row: [N] whole numbers; the row is that of the first pixel centre below.
+    first: [E], the first crossing of every edge; run: [E], columns from its start to its end, with their sign.
     """
-    height, width = size
-    first, last = (np.ceil(points[:, 0] - 0.5).clip(0, width).astype(np.int64) for points in (start, end))
-    left, counts = np.minimum(first, last), np.abs(last - first)
-    edge = np.repeat(np.arange(len(start)), counts)
-    column = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts - left, counts)
-    d = end - start
-    slope = np.divide(d[:, 1], d[:, 0], out=np.zeros(len(d)), where=counts > 0)
-    y = (start[:, 1] - (start[:, 0] - 0.5) * slope)[edge] + column * slope[edge]
-    row = np.ceil(y - 0.5 - _TIE).clip(0, height).astype(np.int64)
-    return edge, row, column, np.sign(last - first)[edge]
+
+    column: FloatArray
+    row: FloatArray
+    first: IntArray
+    run: IntArray
+
+
+def crossings(start: FloatArray, end: FloatArray, width: int | None = None) -> Crossings:
+    """Crossings of edges [E, 2] -> [E, 2] with columns, px from the CENTRE of the first pixel.
+
+    width: that the columns are limited to; without it no point may lie beside the grid.
+    """
+    x, d = start[:, 0], end - start
+    dx = d[:, 0]
+    left, right = np.ceil(x), np.ceil(end[:, 0])
+    if width is not None:
+        left, right = left.clip(0, width), right.clip(0, width)
+    run = (right - left).astype(np.int64)
+    counts = np.abs(run)
+    first = counts.cumsum()
+    first -= counts
+    column = (np.minimum(left, right) - first).repeat(counts)
+    column += np.arange(len(column), dtype=np.float64)
+    slope = d[:, 1] / (dx + (dx == 0))
+    row = slope.repeat(counts)
+    row *= column
+    row += (start[:, 1] - x * slope).repeat(counts)
+    return Crossings(column, np.ceil(row, out=row), first, run)
 
 
 def vertices(polygons: Sequence[Polygon]) -> int:

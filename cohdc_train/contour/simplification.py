@@ -2,21 +2,25 @@
 
 from collections.abc import Callable, Sequence
 from heapq import heapify, heappop, heappush
+from math import exp, hypot
 from typing import Literal, get_args
 
 import cv2
 import numpy as np
 
 from cohdc_train.contour.beetle import BeetleSearch, search_vertices
+from cohdc_train.contour.bracket import Bracket
 from cohdc_train.contour.coverage import Coverage
 from cohdc_train.contour.polygons import FloatArray, Polygon, vertices
 
 Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
 METHODS: tuple[Method, ...] = get_args(Method)
-Reduction = Callable[[Sequence[Polygon], float], list[Polygon]]
+Reduction = Callable[[FloatArray, float], FloatArray]
 
-_BISECTIONS = 7  # evaluations, on a scale of equal ratios
+_EVALUATIONS = 9  # of a tolerance at most; four or five do
 _FINEST, _COARSEST = 0.25, 0.1  # tolerances looked at: px, and a share of the outline's diagonal
+_FINER = 0.9
+_LOST = 0.175  # area lost per px of tolerance and px of outline, about
 
 
 def simplify(
@@ -34,7 +38,7 @@ def simplify(
     reached. `dp` is plain Douglas-Peucker with a fixed tolerance, which knows no floor.
 
     But for `dp`, rings of a result do not cross themselves or each other; where a coarser one would, the finer one
-    stays. Parts and holes too small to keep three vertices vanish where the floor allows it.
+    stays. Small parts and holes vanish where the floor allows it.
 
     Args:
         polygons: as `trace` gives them.
@@ -51,7 +55,7 @@ def simplify(
     if not polygons:
         return []
     if method == "dp":
-        return _douglas_peucker(polygons, epsilon)
+        return _each_ring(polygons, _douglas_peucker, epsilon)
     coverage = Coverage(polygons)
     finer = _bisect(polygons, iou_floor, coverage, _visvalingam if method == "visvalingam" else _douglas_peucker)
     if method != "bas_dp":
@@ -61,47 +65,45 @@ def simplify(
 
 def _bisect(polygons: Sequence[Polygon], iou_floor: float, coverage: Coverage, reduce: Reduction) -> list[Polygon]:
     """The result with the fewest vertices among tolerances that keep the floor; the outline itself if none does."""
-    points = np.concatenate([polygon.outer for polygon in polygons])
-    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    low, high = np.log(_FINEST), np.log(max(_COARSEST * diagonal, 2 * _FINEST))
+    length = sum(cv2.arcLength(ring.astype(np.float32), True) for polygon in polygons for ring in polygon.rings)
+    coarsest = max(_COARSEST * hypot(*(coverage.high - coverage.low)), 2 * _FINEST)
+    bracket = Bracket.of(_FINEST, coarsest, 1 - iou_floor, _LOST * length / coverage.area)
     kept: list[list[Polygon]] = []
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        coarser = reduce(polygons, float(np.exp(middle)))
-        if coverage.iou(coarser) >= iou_floor:
-            low = middle
+    for _ in range(_EVALUATIONS):
+        coarser = _each_ring(polygons, reduce, exp(bracket.at))
+        iou = coverage.iou(coarser)
+        if iou >= iou_floor:
             kept.append(coarser)
-        else:
-            high = middle
+        if not bracket.add(1 - iou, vertices(coarser), iou >= iou_floor):
+            break
     # The IoU does not fall evenly, so that a later one may have more vertices.
     for coarser in sorted(kept, key=vertices):
-        if coverage.keep(coarser, iou_floor):
+        if coverage.valid(coarser):
+            return coarser
+    epsilon = exp(bracket.low.at)
+    while kept and (epsilon := epsilon * _FINER) > _FINEST:  # rings cross: where they do not yet
+        coarser = _each_ring(polygons, reduce, epsilon)
+        if coverage.iou(coarser) >= iou_floor and coverage.valid(coarser):
             return coarser
     return list(polygons)
 
 
-def _douglas_peucker(polygons: Sequence[Polygon], epsilon: float) -> list[Polygon]:
-    return _each_ring(
-        polygons,
-        lambda ring: cv2.approxPolyDP(ring.astype(np.float32), epsilon, True).reshape(-1, 2).astype(np.float64),
-    )
-
-
-def _visvalingam(polygons: Sequence[Polygon], epsilon: float) -> list[Polygon]:
-    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px, smallest first."""
-    return _each_ring(polygons, lambda ring: _without_small_triangles(ring, epsilon**2))
-
-
-def _each_ring(polygons: Sequence[Polygon], reduce: Callable[[FloatArray], FloatArray]) -> list[Polygon]:
+def _each_ring(polygons: Sequence[Polygon], reduce: Reduction, epsilon: float) -> list[Polygon]:
     reduced = []
     for polygon in polygons:
-        outer, *holes = (reduce(ring) for ring in polygon.rings)
+        outer, *holes = (reduce(ring, epsilon) for ring in polygon.rings)
         if len(outer) >= 3:
             reduced.append(Polygon(outer, tuple(hole for hole in holes if len(hole) >= 3)))
     return reduced
 
 
-def _without_small_triangles(ring: FloatArray, area: float) -> FloatArray:
+def _douglas_peucker(ring: FloatArray, epsilon: float) -> FloatArray:
+    return cv2.approxPolyDP(ring.astype(np.float32), epsilon, True).reshape(-1, 2).astype(np.float64)
+
+
+def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
+    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px, smallest first."""
+    area = epsilon**2
     x: list[float] = ring[:, 0].tolist()
     y: list[float] = ring[:, 1].tolist()
     count = len(ring)

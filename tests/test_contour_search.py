@@ -1,0 +1,107 @@
+"""Parts of the two searches: the bracket of tolerances, and the beetles."""
+
+from math import exp, log
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cohdc_train.contour import BeetleSearch, Polygon, rasterize, simplify, trace, vertices
+from cohdc_train.contour.beetle import _Beetles
+from cohdc_train.contour.bracket import Bracket
+from cohdc_train.contour.coverage import Coverage, crossing
+
+SIZE = (96, 128)
+
+
+def two_discs(radius: float) -> NDArray[np.bool_]:
+    """One of 30 px, and one beside it."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    big, small = (x - 40) ** 2 + (y - 48) ** 2 < 30**2, (x - 100) ** 2 + (y - 48) ** 2 < radius**2
+    return np.asarray(big | small)
+
+
+@given(st.floats(0.5, 20), st.floats(0.5, 2), st.floats(0.3, 3), st.floats(0.001, 0.3))
+@settings(max_examples=100, deadline=None)
+def test_bracket_closes_on_the_tolerance_that_reaches_the_floor(
+    right: float, power: float, wrong: float, allowed: float
+) -> None:
+    """What is lost is a power of the tolerance; the first guess is off by `wrong`. Vertices never end the search."""
+    bracket = Bracket.of(0.25, 40.0, allowed, wrong * allowed / right)
+    tried = 0
+    while True:
+        tried += 1
+        lost = allowed * (exp(bracket.at) / right) ** power
+        kept = exp(bracket.low.at)
+        if not bracket.add(lost, round(1e6 / exp(bracket.at)), lost <= allowed):
+            break
+        assert exp(bracket.low.at) >= kept
+    assert tried <= 12
+    assert exp(bracket.low.at) <= right
+    assert log(right) - bracket.low.at < 0.1
+
+
+def test_bracket_ends_when_its_ends_differ_by_one_vertex() -> None:
+    bracket = Bracket.of(0.25, 40.0, 0.05, 0.05)
+    assert bracket.add(0.02, 12, True)
+    assert not bracket.add(0.09, 11, False)
+
+
+@given(st.lists(st.integers(3, 9), min_size=1, max_size=4), st.integers(0, 20))
+@settings(max_examples=60, deadline=None)
+def test_beetles_of_a_turn_are_no_neighbours_and_every_beetle_gets_its_turn(sizes: list[int], first: int) -> None:
+    rings = []
+    for k, size in enumerate(sizes):
+        angle = np.arange(size) * 2 * np.pi / size
+        rings.append(np.stack([10 + 20 * k + 8 * np.cos(angle), 10 + 8 * np.sin(angle)], axis=1))
+    polygons = [Polygon(ring) for ring in rings]
+    beetles = _Beetles(polygons, Coverage(polygons), pairs=4)
+    moved = set()
+    for k in range(max(sizes)):
+        for index in beetles._turns(first + k):
+            assert not set(beetles._after[index].tolist()) & set(index.tolist())
+            moved |= set(index.tolist())
+    assert moved == set(range(sum(sizes)))
+
+
+def test_a_small_part_goes_as_a_whole_and_a_larger_one_stays() -> None:
+    """Bisection keeps the small one, as it has more than two vertices."""
+    small, large = trace(two_discs(4)), trace(two_discs(12))
+    assert len(simplify(small, 0.95)) == 2
+    assert len(simplify(small, 0.95, "bas_dp")) == 1
+    assert len(simplify(large, 0.95, "bas_dp")) == 2
+
+
+def test_moves_after_the_last_drop_raise_the_iou() -> None:
+    """Above what the floor asks for, with the vertices that are left."""
+    mask = two_discs(25)
+    polygons = trace(mask)
+    spare = [Coverage(polygons).iou(simplify(polygons, floor, "bas_dp")) - floor for floor in (0.93, 0.95, 0.97)]
+    assert min(spare) >= 0
+    assert max(spare) > 0.005
+
+
+def test_without_moves_there_is_nothing_but_dropping() -> None:
+    polygons = trace(two_discs(25))
+    simpler = simplify(polygons, 0.95, "bas_dp", search=BeetleSearch(n=0))
+    corners = {tuple(p) for polygon in polygons for p in polygon.outer.tolist()}
+    assert {tuple(p) for polygon in simpler for p in polygon.outer.tolist()} <= corners
+
+
+@pytest.mark.parametrize("c", [1.0, 2.0])
+def test_whiskers_of_any_length_keep_the_floor(c: float) -> None:
+    mask = two_discs(25)
+    simpler = simplify(trace(mask), 0.97, "bas_dp", search=BeetleSearch(c=c))
+    filled = rasterize(simpler, SIZE)
+    assert (filled & mask).sum() / (filled | mask).sum() >= 0.97
+    assert vertices(simpler) < vertices(simplify(trace(mask), 0.97))
+
+
+def test_crossings_are_found_between_blocks_of_edges() -> None:
+    angle = np.arange(3000) * 2 * np.pi / 3000
+    circle = np.round(np.stack([np.cos(angle), np.sin(angle)], axis=1) * 5000) / 10
+    assert not crossing([circle])
+    assert not crossing([circle, circle * 0.9])
+    assert crossing([circle, circle + np.array([30.0, 17.3])])
