@@ -96,22 +96,17 @@ def _reach(places: NDArray[np.int64], radius: float) -> slice:
     return slice(max(int(places[0]) - margin, 0), int(places[-1]) + margin + 1)
 
 
-def dynamic_mask(
-    detections: Detections, labels: frozenset[int], culling: Culling, depth: NDArray[np.float32] | None = None
-) -> Mask:
-    """The union of the dynamic objects' masks, each grown by what `growth` says of its quality, and of their bays.
+def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Culling) -> Mask:
+    """The union of the dynamic objects' masks, each grown by what `growth` says of its quality.
 
     A contour that CQE doubts gets a wider band instead of being left out, for a missed person costs more than lost
-    corners. depth: [H, W] m, 0 = none; without it no bay is filled.
+    corners.
     Returns [H, W] bool, True = dynamic.
     """
     chosen = dynamic_objects(detections, labels, culling)
-    masks = chosen.masks()
     union = np.zeros(detections.size, dtype=np.bool_)
-    for mask, quality in zip(masks, chosen.quality, strict=True):
+    for mask, quality in zip(chosen.masks(), chosen.quality, strict=True):
         union |= grow(mask, growth(culling, float(quality)))
-    if depth is not None:
-        union |= grow(bays_of(np.asarray(masks.any(axis=0)), depth, culling.bays), culling.dilate)
     return union
 
 
@@ -162,7 +157,10 @@ class ModelMasks:
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool."""
-        return dynamic_mask(self._segmenter(view.rgb), self._labels, self._culling, view.depth)
+        found, culling = self._segmenter(view.rgb), self._culling
+        union = np.asarray(dynamic_objects(found, self._labels, culling).masks().any(axis=0))
+        bays = bays_of(union, view.depth, culling.bays)
+        return np.asarray(dynamic_mask(found, self._labels, culling) | grow(bays, culling.dilate))
 
     def outline(self, view: View) -> tuple[Mask, float]:
         """The mask before it grows, and by how many px it is to: as much as its contours should on average."""
