@@ -14,9 +14,6 @@ from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.source import View
 from cohdc_train.slam.tum import read_mask
 
-_COARSE = 4  # px of the image per px that bays are looked for on
-_SAME_DEPTH = 0.25  # m between a bay and what is masked around it
-
 Mask = NDArray[np.bool_]
 MaskSource = Callable[[View], Mask | None]
 
@@ -32,7 +29,6 @@ class Culling:
             person left in: by default none is.
         dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (1 + doubt * (1 - q)).
         doubt: how much more a contour grows that CQE trusts not at all; at 0 all grow alike.
-        bays: px; gaps in a model's masks narrower than twice this are filled where depth goes on. At 0 none is.
     """
 
     dynamic_classes: list[str] | None = None
@@ -40,12 +36,10 @@ class Culling:
     quality: float = 0.0
     dilate: int = 10
     doubt: float = 1.0
-    bays: int = 100
 
     def __post_init__(self) -> None:
-        for name in ("dilate", "bays"):
-            if getattr(self, name) < 0:
-                raise DataError(f"{name} is {getattr(self, name)}; it cannot be below 0")
+        if self.dilate < 0:
+            raise DataError(f"dilate is {self.dilate}; it cannot be below 0")
         if not 0 <= self.doubt < float("inf"):
             raise DataError(f"doubt is {self.doubt:g}; it cannot be below 0 or infinite")
         for name in ("score", "quality"):
@@ -63,31 +57,6 @@ def grow(mask: Mask, radius: float) -> Mask:
     grown = np.zeros_like(mask)
     grown[window] = distance <= radius
     return grown
-
-
-def bays_of(mask: Mask, depth: NDArray[np.float32], radius: int) -> Mask:
-    """What a mask [H, W] leaves out of the things it shows: its bays and holes, at the depth of what is masked around.
-
-    A segmenter finds the arms and hips of a near person and leaves out the vest between them, whose corners move along.
-    depth: [H, W] m, 0 = none, which fills a bay too; radius: px of the discs that fit into no bay. Returns [H, W] bool.
-    """
-    if radius < _COARSE or not mask.any():
-        return np.zeros_like(mask)
-    height, width = mask.shape
-    size = (width // _COARSE, height // _COARSE)
-    coarse = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    image = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
-    reach = radius // _COARSE
-    rim = 2 * reach
-    padded = np.pad(coarse > 0, rim, mode="edge")
-    closed = ~grow(~grow(padded, reach), reach)[rim:-rim, rim:-rim]
-    known = ((coarse > 0) & (image > 0)).astype(np.float32)
-    window = (2 * reach + 1, 2 * reach + 1)
-    weight = cv2.blur(known, window)
-    around = cv2.blur(known * image, window) / np.maximum(weight, 1e-6)
-    same = (weight > 0) & ((image == 0) | (np.abs(image - around) < _SAME_DEPTH))
-    found = (closed & same & (coarse == 0)).astype(np.uint8)
-    return np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & ~mask
 
 
 def _reach(places: NDArray[np.int64], radius: float) -> slice:
@@ -157,14 +126,10 @@ class ModelMasks:
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool."""
-        found, culling = self._segmenter(view.rgb), self._culling
-        union = np.asarray(dynamic_objects(found, self._labels, culling).masks().any(axis=0))
-        bays = bays_of(union, view.depth, culling.bays)
-        return np.asarray(dynamic_mask(found, self._labels, culling) | grow(bays, culling.dilate))
+        return dynamic_mask(self._segmenter(view.rgb), self._labels, self._culling)
 
     def outline(self, view: View) -> tuple[Mask, float]:
         """The mask before it grows, and by how many px it is to: as much as its contours should on average."""
         chosen = dynamic_objects(self._segmenter(view.rgb), self._labels, self._culling)
         quality = float(chosen.quality.mean()) if len(chosen) else 1.0
-        union = np.asarray(chosen.masks().any(axis=0))
-        return union | bays_of(union, view.depth, self._culling.bays), growth(self._culling, quality)
+        return np.asarray(chosen.masks().any(axis=0)), growth(self._culling, quality)

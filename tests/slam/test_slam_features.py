@@ -9,7 +9,7 @@ from plane_world import CAMERA, render, room
 
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
-from cohdc_train.slam.culling import Culling, bays_of, dynamic_mask, grow
+from cohdc_train.slam.culling import Culling, dynamic_mask, grow
 from cohdc_train.slam.features import FeatureExtractor, Features, hamming, sample_depth, spread
 
 
@@ -99,28 +99,6 @@ def test_doubtful_contours_get_a_wider_band_and_are_never_dropped() -> None:
     assert not unsure[125, 78]
 
 
-def test_a_bay_is_filled_where_depth_goes_on() -> None:
-    """Two arms and a chest around a vest 80 px wide, and a gap as wide through which the wall is seen."""
-    mask = np.zeros((240, 320), dtype=np.bool_)
-    depth = np.full(mask.shape, 3.0, dtype=np.float32)
-    mask[40:240, 40:60] = mask[40:240, 140:160] = mask[40:60, 40:160] = True
-    depth[40:240, 40:160] = 1.0
-    mask[40:240, 240:260] = True  # an arm beyond the gap
-    depth[40:240, 240:260] = 1.0
-    depth[150:160, 90:100] = 0.0
-    filled = mask | bays_of(mask, depth, 60)
-    assert filled[64:236, 64:136].all(), "the vest, with the hole in its depth"
-    assert not filled[60:220, 168:232].any(), "the gap"
-    assert not filled[:36].any()
-    assert not filled[:, 268:].any()
-    assert not bays_of(mask, depth, 20)[100:, 80:120].any(), "the middle of a bay wider than twice the radius"
-    assert not bays_of(mask, depth, 0).any()
-    assert not bays_of(np.zeros_like(mask), depth, 60).any()
-    torn = np.zeros_like(mask)
-    torn[40:60, 40:160] = True
-    assert not bays_of(torn, depth, 60)[100:].any(), "what lies outside of all bays"
-
-
 def test_without_doubt_all_contours_grow_alike() -> None:
     box = (100.0, 100.0, 150.0, 150.0)
     masks = [
@@ -168,9 +146,7 @@ def test_grow_is_a_disc() -> None:
     assert grow(mask, 0.0).sum() == 1
 
 
-@pytest.mark.parametrize(
-    "bad", [{"dilate": -1}, {"score": 1.5}, {"bays": -1}, {"doubt": -0.1}, {"doubt": float("nan")}]
-)
+@pytest.mark.parametrize("bad", [{"dilate": -1}, {"score": 1.5}, {"doubt": -0.1}, {"doubt": float("nan")}])
 def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(DataError, match=next(iter(bad))):
         Culling(**bad)  # type: ignore[arg-type]

@@ -67,14 +67,7 @@ def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequenc
     assert rows[0]["keyframe"] == "1"
     assert all(0.2 < float(row["culled_share"]) < 0.6 for row in rows)
     config = yaml.safe_load((masked / "config.yaml").read_text())
-    assert config["culling"] == {
-        "dynamic_classes": None,
-        "score": 0.5,
-        "quality": 0.0,
-        "dilate": 7,
-        "doubt": 1.0,
-        "bays": 100,
-    }
+    assert config["culling"] == {"dynamic_classes": None, "score": 0.5, "quality": 0.0, "dilate": 7, "doubt": 1.0}
     assert config["camera"]["fx"] == 260
     assert config["seed"] == 1
 
