@@ -145,6 +145,7 @@ def test_a_training_is_done_once_and_again_when_its_options_change(tmp_path, mon
     assert len(calls) == 3
 
 
+@pytest.mark.slow
 def test_a_failed_step_names_its_log(tmp_path):
     with pytest.raises(CohdcError, match=r"log\.txt: cohdc fit failed with"):
         call(tmp_path / "log.txt", "fit", "--no.such.option=1")

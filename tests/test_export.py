@@ -112,6 +112,7 @@ def test_the_segmenter_sees_what_the_network_sees_at_a_third_size(exported, opin
     assert found.masks().shape == (len(found), 111, 222)
 
 
+@pytest.mark.slow
 def test_another_canvas_than_the_trainings(checkpoint, opinionated, tmp_path):
     rows, columns = opinionated.config.canvas
     larger = (rows + 64, columns + 32)

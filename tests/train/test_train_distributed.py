@@ -124,6 +124,7 @@ def test_gradients_that_are_not_averaged_show(root: Path, one: Any) -> None:
     assert not all(torch.equal(weight, apart[1]["weights"][name]) for name, weight in apart[0]["weights"].items())
 
 
+@pytest.mark.slow
 def test_a_rank_without_an_object_finishes(tmp_path: Path) -> None:
     """One of two images has no object; every step, one of the two processes has nothing to find."""
     boxes = {"train": [((4, 8), (40, 20)), ()], "val": [((4, 8), (40, 20))]}
