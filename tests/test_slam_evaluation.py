@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from slam_method import chosen_method
 
 pytest.importorskip("embreex")
 
@@ -79,12 +80,12 @@ def test_other_code_drops_old_rows(tool: ModuleType, folder: Path, tmp_path: Pat
     assert tool.kept(tmp_path / "nothing.json", "new") == []
 
 
-def test_switches_of_the_method(tool: ModuleType) -> None:
-    assert tool.chosen_method(["loops=false"]).loops is False
+def test_switches_of_the_method() -> None:
+    assert chosen_method(["loops=false"]).loops is False
     with pytest.raises(ValueError, match="'loop' is none of loops"):
-        tool.chosen_method(["loop=false"])
+        chosen_method(["loop=false"])
     with pytest.raises(ValueError, match="'perhaps' is no bool"):
-        tool.chosen_method(["loops=perhaps"])
+        chosen_method(["loops=perhaps"])
 
 
 def test_a_set_of_another_size_is_not_taken_for_this_one(tool: ModuleType, folder: Path) -> None:

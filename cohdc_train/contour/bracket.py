@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from math import log
 
-NARROW = 0.036  # of a logarithm: the bracket is not made narrower
+_NARROW = 0.036  # of a logarithm: the bracket is not made narrower
 _CLIP = 0.35  # the next tolerance keeps that share of the bracket to either end
 _FIRST_STEP = 0.06  # of a logarithm, as long as one end is not known
 _AIM, _ENOUGH = 0.02, 0.04  # logarithm of what may be lost over what is: aimed at, and good enough to end with
@@ -37,7 +37,7 @@ class Bracket:
     def of(cls, finest: float, coarsest: float, allowed: float, rise: float) -> "Bracket":
         """Between two tolerances, px. allowed: 1 - the floor; rise: what is lost per px of tolerance."""
         low, high, allowed = log(finest), log(coarsest), max(allowed, _LEAST_LOST)
-        return cls(_End(low), _End(high), allowed, min(max(log(allowed / rise), low + NARROW), high - NARROW))
+        return cls(_End(low), _End(high), allowed, min(max(log(allowed / rise), low + _NARROW), high - _NARROW))
 
     def add(self, lost: float, vertices: int, keeps: bool) -> bool:
         """What came out at `at`; whether another tolerance is worth a try.
@@ -51,7 +51,7 @@ class Bracket:
         else:
             self.high = here
         low, high = self.low, self.high
-        if (keeps and here.excess > -_ENOUGH) or high.at - low.at < NARROW:
+        if (keeps and here.excess > -_ENOUGH) or high.at - low.at < _NARROW:
             return False
         if low.vertices is None or high.vertices is None:
             step, self._step = max(abs(here.excess + _AIM), self._step), 2 * self._step

@@ -66,14 +66,10 @@ def trace(mask: NDArray[np.bool_]) -> list[Polygon]:
 
 def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> NDArray[np.bool_]:
     """Fill polygons by the even-odd rule at pixel centres. size: (height, width), px. Returns [height, width] bool."""
-    return _fill([ring for polygon in polygons for ring in polygon.rings], size)
-
-
-def _fill(rings: Sequence[FloatArray], size: tuple[int, int]) -> NDArray[np.bool_]:
-    height, width = size
-    if not rings:
+    if not polygons:
         return np.zeros(size, np.bool_)
-    start, end = edges(rings)
+    height, width = size
+    start, end = edges([ring for polygon in polygons for ring in polygon.rings])
     met = crossings(start - CENTRE, end - CENTRE, width)
     place = met.row.clip(0, height) * width + met.column
     hits = np.bincount(place.astype(np.int64), minlength=(height + 1) * width).reshape(height + 1, width)

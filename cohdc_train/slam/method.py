@@ -12,9 +12,9 @@ class Method:
         refinement: a keyframe's measurements move to where the points' patches fit best (paper eqs. 8 and 9).
         geometry: what stands where a keyframe looked through moves, whatever its class; nothing is taken from there. A
             masked thing that has stood still for two seconds is of use until it moves.
-        keyframe_culling: keyframes all but whose every tenth point three others see as well leave the map.
         static_weights: groups of points that do not move with the rest are left out, and count less from then on.
         global_adjustment: when the sequence is over, all keyframes are bundle-adjusted at once.
+        keyframe_culling: a keyframe leaves the map when three others see nine in ten of its points as well.
     """
 
     loops: bool = True

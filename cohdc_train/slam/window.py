@@ -96,8 +96,9 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
         return None
     motion: Array = inverse(window.poses[-1]) @ solution.poses[-1]
     newest = window.keyframes[-1].index
-    for later in [k for k in world.keyframes if k.index > newest]:
-        later.T_cw = later.T_cw @ motion
+    for keyframe in world.keyframes:
+        if keyframe.index > newest:
+            keyframe.T_cw = keyframe.T_cw @ motion
     added = np.flatnonzero(world.born[: world.size] > newest)
     world.positions[added] = to_local(inverse(motion), world.positions[added])
     same = world.born[window.ids] <= newest  # a younger point may have taken the row of one that is gone
