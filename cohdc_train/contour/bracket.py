@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from math import log
 
-_NARROW = 0.036  # of a logarithm: the bracket is not made narrower
+_NARROW = 0.06  # of a logarithm: the bracket is not made narrower
 _CLIP = 0.35  # the next tolerance keeps that share of the bracket to either end
 _FIRST_STEP = 0.06  # of a logarithm, as long as one end is not known
-_AIM, _ENOUGH = 0.02, 0.04  # logarithm of what may be lost over what is: aimed at, and good enough to end with
+_AIM, _ENOUGH = 0.04, 0.08  # logarithm of what may be lost over what is: aimed at, and good enough to end with
 _LEAST_LOST = 1e-6
 
 

@@ -1,7 +1,7 @@
 """How well polygons cover an outline, told by where edges cross the columns of pixels."""
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.contour.polygons import CENTRE, FloatArray, IntArray, Polygon, crossings, edges
 
-GRID = 0.2  # px, between places for a vertex: one decimal in a file, and the grid that COCO's tools fill on
+_PER_PX = 5  # places for a vertex along a px: one decimal in a file, and the grid that COCO's tools fill on
 
 
 class Coverage:
@@ -43,8 +43,15 @@ class Coverage:
         both = np.concatenate((self._places, places))
         places.sort()
         both.sort()
-        covered, apart = _enclosed(places), _enclosed(both)
+        return self.iou_about(_enclosed(places), _enclosed(both))
+
+    def iou_about(self, covered: float, apart: int) -> float:
+        """IoU of what covers so many pixels, so many of which only one of it and the outline has."""
         return (self.area + covered - apart) / (self.area + covered + apart)
+
+    def apart(self, start: FloatArray, end: FloatArray) -> int:
+        """Pixels that only one of the outline and closed rings has, which are given as edges [E, 2] -> [E, 2]."""
+        return _enclosed(np.sort(np.concatenate((self._places, self._crossed(start, end)[0]))))
 
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
         """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
@@ -54,7 +61,7 @@ class Coverage:
         """
         places, first, run = self._crossed(start, end)
         alone = np.zeros(len(places) + 1, np.int32)
-        alone[:-1] = self._alone[places.astype(np.int64)]
+        self._alone.take(places.astype(np.int64), out=alone[:-1], mode="clip")
         added: IntArray = np.add.reduceat(alone, first) * np.sign(run)
         return added
 
@@ -72,18 +79,20 @@ class Coverage:
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         """Places where edges cross the columns, the first of every edge, and the columns it runs along."""
-        places, row, first, run = crossings(start - self._first_centre, end - self._first_centre)
+        places, row, first, run = crossings(start, end, self._first_centre)
         places *= self._rows
         places += row
         return places, first, run
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """Points [..., 2] moved onto the GRID and into the outline's bounds."""
-        placed: FloatArray = np.rint((points - self.low) / GRID)
-        placed *= GRID
-        placed += self.low
-        np.maximum(placed, self.low, out=placed)
-        np.minimum(placed, self.high, out=placed)
+        """Points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
+        placed: FloatArray = points * _PER_PX  # exact for what is traced, so that halves go the same way everywhere
+        placed += 0.5
+        np.floor(placed, out=placed)
+        placed /= _PER_PX
+        for axis in range(2):
+            line = placed[..., axis]
+            np.clip(line, self.low[axis], self.high[axis], out=line)
         return placed
 
     def valid(self, polygons: Sequence[Polygon]) -> bool:
@@ -96,7 +105,13 @@ class Coverage:
 
 def _enclosed(places: FloatArray) -> int:
     """Pixels between places in order."""
-    return int((places[1::2] - places[::2]).sum())
+    return int(_signs(len(places).bit_length())[: len(places)] @ places)
+
+
+@cache
+def _signs(bits: int) -> FloatArray:
+    """-1, 1, -1, 1 and so on, 2^bits of them."""
+    return np.tile([-1.0, 1.0], 2**bits // 2)
 
 
 def _turn(ring: FloatArray) -> int:

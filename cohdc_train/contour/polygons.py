@@ -70,7 +70,7 @@ def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> NDArray[np.
         return np.zeros(size, np.bool_)
     height, width = size
     start, end = edges([ring for polygon in polygons for ring in polygon.rings])
-    met = crossings(start - CENTRE, end - CENTRE, width)
+    met = crossings(start, end, CENTRE, width)
     place = met.row.clip(0, height) * width + met.column
     hits = np.bincount(place.astype(np.int64), minlength=(height + 1) * width).reshape(height + 1, width)
     odd = np.bitwise_xor.accumulate(hits[:height].astype(np.uint8), axis=0) & 1
@@ -98,14 +98,16 @@ class Crossings(NamedTuple):
     run: IntArray
 
 
-def crossings(start: FloatArray, end: FloatArray, width: int | None = None) -> Crossings:
-    """Crossings of edges [E, 2] -> [E, 2] with columns, px from the CENTRE of the first pixel.
+def crossings(start: FloatArray, end: FloatArray, origin: FloatArray, width: int | None = None) -> Crossings:
+    """Crossings of edges [E, 2] -> [E, 2], px, with columns.
 
-    width: that the columns are limited to; without it no point may lie beside the grid.
+    origin: [2] px, the CENTRE of the grid's first pixel. width: that the columns are limited to; without it no point
+    may lie beside the grid.
     """
-    x, d = start[:, 0], end - start
-    dx = d[:, 0]
-    left, right = np.ceil(x), np.ceil(end[:, 0])
+    x, to_x = start[:, 0] - origin[0], end[:, 0] - origin[0]
+    y = start[:, 1] - origin[1]
+    dx, dy = to_x - x, end[:, 1] - start[:, 1]
+    left, right = np.ceil(x), np.ceil(to_x)
     if width is not None:
         left, right = left.clip(0, width), right.clip(0, width)
     run = (right - left).astype(np.int64)
@@ -114,10 +116,10 @@ def crossings(start: FloatArray, end: FloatArray, width: int | None = None) -> C
     first -= counts
     column = (np.minimum(left, right) - first).repeat(counts)
     column += np.arange(len(column), dtype=np.float64)
-    slope = d[:, 1] / (dx + (dx == 0))
+    slope = dy / (dx + (dx == 0))
     row = slope.repeat(counts)
     row *= column
-    row += (start[:, 1] - x * slope).repeat(counts)
+    row += (y - x * slope).repeat(counts)
     return Crossings(column, np.ceil(row, out=row), first, run)
 
 
