@@ -4,28 +4,38 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+Window = tuple[NDArray[np.bool_], tuple[int, int]]
+
 
 def paste_roi_mask(
     roi_mask: NDArray[np.float32], box: NDArray[np.float32], size: tuple[int, int], threshold: float = 0.5
 ) -> NDArray[np.bool_]:
-    """One RoI mask laid over its box in the image.
+    """One RoI mask laid over its box in the image: [height, width] bool. See `roi_window`."""
+    mask = np.zeros(size, dtype=np.bool_)
+    window, (top, left) = roi_window(roi_mask, box, size, threshold)
+    mask[top : top + window.shape[0], left : left + window.shape[1]] = window
+    return mask
 
-    roi_mask: [M, M] probability; box: [4] xyxy, px; size: (height, width), px. Returns [height, width] bool.
+
+def roi_window(
+    roi_mask: NDArray[np.float32], box: NDArray[np.float32], size: tuple[int, int], threshold: float = 0.5
+) -> Window:
+    """The part of the image's mask that lies in the box: [h, w] bool, and (row, column) of its first pixel.
+
+    roi_mask: [M, M] probability; box: [4] xyxy, px; size: (height, width) of the image, px.
     A pixel's centre is mapped into the RoI grid and sampled bilinearly; pixels whose centre lies outside the box are
-    False.
+    no part of the mask.
     """
     height, width = size
-    mask = np.zeros((height, width), dtype=np.bool_)
     x0, y0, x1, y1 = (float(v) for v in box)
     # pixels whose centre lies inside the box
     left, right = max(int(np.ceil(x0 - 0.5)), 0), min(int(np.ceil(x1 - 0.5)), width)
     top, bottom = max(int(np.ceil(y0 - 0.5)), 0), min(int(np.ceil(y1 - 0.5)), height)
     if right <= left or bottom <= top:
-        return mask
+        return np.zeros((0, 0), np.bool_), (0, 0)
     side = roi_mask.shape[0]
     u = ((np.arange(left, right) + 0.5 - x0) / (x1 - x0) * side - 0.5).astype(np.float32)
     v = ((np.arange(top, bottom) + 0.5 - y0) / (y1 - y0) * side - 0.5).astype(np.float32)
     map_u, map_v = np.meshgrid(u, v)
     sampled = cv2.remap(roi_mask, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    mask[top:bottom, left:right] = sampled > threshold
-    return mask
+    return sampled > threshold, (top, left)

@@ -159,6 +159,7 @@ class CocoDataModule(pl.LightningDataModule):
             for image in split.images:
                 image_files.check(image.path, image.id, (image.width, image.height))
 
+    @cached_property
     def val_ground_truth(self) -> dict[str, Any]:
         """The validation split as a COCO dict with category ids 1..C."""
         return self.folder.val.ground_truth()

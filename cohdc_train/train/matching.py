@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as rle
 
-from cohdc_train.train.metrics import CERTAIN, MATCH_IOU, Results, Row, to_rle
+from cohdc_train.train.metrics import CERTAIN, MATCH_IOU, Results, Row
+from cohdc_train.train.run_lengths import to_rle
 
 
 @dataclass(frozen=True)

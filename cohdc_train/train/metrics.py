@@ -14,7 +14,8 @@ from pycocotools import mask as rle
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from cohdc_train.masks import paste_roi_mask
+from cohdc_train.masks import roi_window
+from cohdc_train.train.run_lengths import boundary_rle, to_rle, window_boundary, window_rle
 
 MATCH_IOU = 0.5  # mask IoU from which a detection counts as having found an object
 HIGH_QUALITY = 0.9  # S > 90
@@ -32,13 +33,13 @@ def encode(image_id: int, size: tuple[int, int], detections: Mapping[str, Tensor
 
     size: (height, width) px; detections: `boxes` [n, 4] xyxy px of the image, `labels` [n] 0-based, `scores` [n],
     `quality` [n], `masks` [n, M, M] RoI probabilities. A row has image_id, category_id from 1, score, quality, bbox
-    xywh, and segmentation, the pasted mask as compressed RLE.
+    xywh, and as compressed RLE segmentation, the pasted mask, and boundary, the band along its contour.
     """
     arrays = {name: value.detach().float().cpu().numpy() for name, value in detections.items()}
     rows = []
     for i in np.argsort(-arrays["scores"], kind="stable")[:_MAX_DETECTIONS]:
         x0, y0, x1, y1 = (float(v) for v in arrays["boxes"][i])
-        mask = paste_roi_mask(arrays["masks"][i], arrays["boxes"][i], size)
+        window, corner = roi_window(arrays["masks"][i], arrays["boxes"][i], size)
         rows.append(
             {
                 "image_id": image_id,
@@ -46,7 +47,8 @@ def encode(image_id: int, size: tuple[int, int], detections: Mapping[str, Tensor
                 "score": float(arrays["scores"][i]),
                 "quality": float(arrays["quality"][i]),
                 "bbox": [x0, y0, x1 - x0, y1 - y0],
-                "segmentation": _encode_mask(mask),
+                "segmentation": window_rle(window, corner, size),
+                "boundary": window_rle(window_boundary(window, size), corner, size),
             }
         )
     return rows
@@ -86,11 +88,16 @@ class SegmentationMetrics:
         self.rescore = rescore
         self.min_quality = min_quality
         self._seen: dict[int, list[Row]] = {}
+        self._boundaries: dict[int, Any] = {}  # of annotations, by id: the same in every epoch
         self._sizes = {int(i["id"]): (int(i["height"]), int(i["width"])) for i in ground_truth["images"]}
 
     def update(self, image_id: int, detections: Mapping[str, Tensor]) -> None:
         """Take the detections of one image (see `encode`); a second visit of the same image replaces the first."""
         self._seen[image_id] = encode(image_id, self._sizes[image_id], detections)
+
+    def reset(self) -> None:
+        """Forget the detections, to score another network on the same ground truth."""
+        self._seen = {}
 
     def compute(self) -> dict[str, float]:
         """The scores of `results`."""
@@ -104,6 +111,10 @@ class SegmentationMetrics:
         """
         seen = _gather(self._seen)
         truth = _restrict(self.ground_truth, seen)
+        for row in truth["annotations"]:
+            if row["id"] not in self._boundaries:
+                self._boundaries[row["id"]] = boundary_rle(row["segmentation"], self._sizes[row["image_id"]])
+            row["boundary"] = self._boundaries[row["id"]]
         everything = [row for image_id in sorted(seen) for row in seen[image_id]]
         rows = [row for row in everything if row["quality"] >= self.min_quality]
         boxes = [{k: row[k] for k in ("image_id", "category_id", "score", "bbox")} for row in rows]
@@ -131,8 +142,12 @@ def average_precision(ground_truth: Mapping[str, Any], results: Sequence[Row], k
 def precision_table(ground_truth: Mapping[str, Any], results: Sequence[Row], kind: Kind) -> NDArray[np.float64]:
     """COCO's precision [IOUS, RECALLS, C]: the best that is reached at this recall or a higher one; -1 in a class
     without objects. Arguments as in `average_precision`."""
-    truth = COCO({key: list(ground_truth[key]) for key in ("images", "categories", "annotations")})
-    evaluation = COCOeval_faster(truth, truth.loadRes([dict(row) for row in results]), kind, print_function=_silent)
+    sizes = {image["id"]: (image["height"], image["width"]) for image in ground_truth["images"]}
+    annotations, found = ([dict(row) for row in rows] for rows in (ground_truth["annotations"], results))
+    for row in [*annotations, *found] if kind == "boundary" else []:
+        row["boundary"] = row.get("boundary") or boundary_rle(row["segmentation"], sizes[row["image_id"]])
+    truth = COCO({**{key: list(ground_truth[key]) for key in ("images", "categories")}, "annotations": annotations})
+    evaluation = _Evaluation(truth, truth.loadRes(found), kind, print_function=_silent)
     evaluation.evaluate()
     evaluation.accumulate()
     return np.asarray(evaluation.eval["precision"])[:, :, :, 0, -1]  # all areas, all detections
@@ -238,19 +253,7 @@ def _match(shapes: list[Any], rows: list[Row]) -> NDArray[np.float64]:
 
 def _mask_row(row: Row, rescore: bool) -> Row:
     score = row["score"] * row["quality"] if rescore else row["score"]
-    return {**{k: row[k] for k in ("image_id", "category_id", "segmentation")}, "score": score}
-
-
-def _encode_mask(mask: NDArray[np.bool_]) -> Any:
-    encoded = rle.encode(np.asfortranarray(mask, dtype=np.uint8))
-    return {"size": list(encoded["size"]), "counts": encoded["counts"].decode()}
-
-
-def to_rle(segmentation: Any, size: tuple[int, int]) -> Any:
-    """Polygons, in px, or compressed RLE -> compressed RLE. size: (height, width) px."""
-    if isinstance(segmentation, dict):
-        return segmentation
-    return rle.merge(rle.frPyObjects(segmentation, *size))
+    return {**{k: row[k] for k in ("image_id", "category_id", "segmentation", "boundary")}, "score": score}
 
 
 def _restrict(ground_truth: Mapping[str, Any], seen: Mapping[int, Any]) -> dict[str, Any]:
@@ -280,6 +283,15 @@ def mean_valid(precision: NDArray[np.float64]) -> float:
     """Mean over the classes that have objects; nan where there is none."""
     valid = precision[precision > -1]  # -1 marks classes without objects
     return float(valid.mean()) if valid.size else np.nan
+
+
+class _Evaluation(COCOeval_faster):  # type: ignore[misc]  # faster-coco-eval is not typed
+    """Takes the boundaries that rows bring; faster-coco-eval traces them over the whole image, for every epoch anew."""
+
+    def _prepare(self) -> None:
+        bounded, self.params.compute_boundary = self.params.compute_boundary, False
+        super()._prepare()
+        self.params.compute_boundary = bounded
 
 
 def _silent(*_: object) -> None:

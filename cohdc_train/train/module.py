@@ -98,7 +98,11 @@ class MaskRCNNModule(pl.LightningModule):
         """Begin new scores, of the weights as they are (the averaged ones, where they are scored)."""
         # In bfloat16 channels last gained nothing (docs/results/training_speed.md).
         self._fused = [fused(self.network, channels_last=self.trainer.precision == "32-true")]
-        self._metrics = SegmentationMetrics(self._data().val_ground_truth(), self.rescore, self.min_quality)
+        truth = self._data().val_ground_truth
+        if self._metrics is None or self._metrics.ground_truth is not truth:
+            self._metrics = SegmentationMetrics(truth)
+        self._metrics.rescore, self._metrics.min_quality = self.rescore, self.min_quality
+        self._metrics.reset()
 
     def validation_step(self, batch: list[ValSample], batch_idx: int) -> None:
         """Collect the detections of the batch's images."""
@@ -113,7 +117,7 @@ class MaskRCNNModule(pl.LightningModule):
         self.results = self._metrics.results()
         for name, value in self.results.scores.items():
             self.log(f"val/{name}", value, prog_bar=name == "segm_AP50", sync_dist=True)
-        self._metrics, self._fused = None, []
+        self._fused = []
 
     def configure_optimizers(self) -> Any:
         """Optimizer over what is trained, and its schedule over the trainer's steps."""

@@ -27,7 +27,7 @@ def module(root: Path, **more: Any) -> CocoDataModule:
 def test_classes_come_from_the_file(tmp_path: Path) -> None:
     data = module(toys.folder(tmp_path))
     assert (data.class_names, data.num_classes) == (["person", "car"], 2)
-    assert data.val_ground_truth()["categories"] == [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}]
+    assert data.val_ground_truth["categories"] == [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}]
 
 
 def test_a_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ for batch in data.train_dataloader():
 assert all(torch.isfinite(p.grad).all() for p in network.parameters())
 trained = peak()
 network.eval()
-metrics = SegmentationMetrics(data.val_ground_truth())
+metrics = SegmentationMetrics(data.val_ground_truth)
 for batch in data.val_dataloader():
     for (image, number), found in zip(batch, detect(network, [image for image, _ in batch])):
         metrics.update(number, found)

@@ -162,6 +162,19 @@ def test_perfect_and_missed_objects() -> None:
     assert (scores["mIoU"], scores["S90_matched"], scores["S90_all"]) == (0.5, 1.0, 0.5)
 
 
+def test_the_next_epoch_is_scored_like_the_first_one() -> None:
+    truth = truth_of(square(10, 10, 20), square(50, 10, 20))
+    metrics, fresh = SegmentationMetrics(truth), SegmentationMetrics(truth)
+    metrics.update(7, detection([[10, 10, 30, 30]], [0.9], [1.0]))
+    first = metrics.compute()
+    metrics.reset()
+    second = detection([[50, 10, 70, 30], [12, 10, 32, 30]], [0.8, 0.9], [1.0, 1.0])
+    metrics.update(7, second)
+    fresh.update(7, second)
+    assert metrics.compute() == pytest.approx(fresh.compute(), nan_ok=True)
+    assert metrics.compute()["mIoU"] > first["mIoU"]
+
+
 def test_rescoring_ranks_masks_by_quality_and_leaves_boxes() -> None:
     wrong, right = [50.0, 30.0, 70.0, 50.0], [10.0, 10.0, 30.0, 30.0]
     scores = {}
