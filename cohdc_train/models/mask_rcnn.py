@@ -41,7 +41,10 @@ class NetworkConfig:
         width: channels of the backbone as a share of ResNet's.
         rates: dilation patterns of the four stages.
         weights: torchvision name or local path of ImageNet weights for the backbone; None trains from scratch.
-        norm: "batch" trains BatchNorm, in the pyramid too; "frozen" keeps the weights' statistics.
+        norm: of the backbone, and "batch" of the pyramid too: "batch" trains BatchNorm, "frozen" keeps the weights'
+            statistics.
+        head_norm: "batch" trains BatchNorm in the pyramid and the mask head whatever the backbone has; exported, it
+            costs nothing.
         frozen_stages: how many of the stem and the four stages are not trained.
         canvas: (height, width) in px every image is fitted into.
         finest_stride: of the pyramid: 4, or 8 without the level that costs most and sees the smallest objects.
@@ -66,6 +69,7 @@ class NetworkConfig:
     rates: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3))
     weights: str | None = None
     norm: Norm = "batch"
+    head_norm: Literal["none", "batch"] = "none"
     frozen_stages: int = 0
     canvas: tuple[int, int] = (800, 1024)
     finest_stride: Literal[4, 8] = 4
@@ -114,7 +118,7 @@ class Backbone(nn.Module):
         if config.weights is not None:
             self.body.load(config.weights)
         pool = LastLevelMaxPool() if len(config.anchor_scales) > len(self.levels) else None
-        norm = nn.BatchNorm2d if config.norm == "batch" else None
+        norm = nn.BatchNorm2d if "batch" in (config.norm, config.head_norm) else None
         self.fpn = FeaturePyramidNetwork(self.body.out_channels[-len(self.levels) :], config.fpn_channels, pool, norm)
 
     def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
@@ -255,6 +259,6 @@ def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:
         nms_thresh=config.nms_iou,
         detections_per_img=config.detections,
         mask_roi_pool=MultiScaleRoIAlign(config.roi_levels(), 14, 2),
-        mask_head=MaskRCNNHeads(channels, (channels,) * 4, 1),
+        mask_head=MaskRCNNHeads(channels, (channels,) * 4, 1, nn.BatchNorm2d if config.head_norm == "batch" else None),
         mask_predictor=mask_predictor(channels, num_classes + 1, config.mask_size),
     )

@@ -18,7 +18,10 @@ SHAPES = {
 def network_of(shape, norm):
     torch.manual_seed(0)
     small = {"canvas": (96, 128), "fpn_channels": 16, "fc": 32, "proposals": (50, 20), "detections": 10}
-    network = MaskRCNN(3, NetworkConfig(**SHAPES[shape], **small, norm=norm, score_threshold=0.0)).eval()
+    head_norm = "batch" if shape == "resnet50" else "none"
+    network = MaskRCNN(
+        3, NetworkConfig(**SHAPES[shape], **small, norm=norm, head_norm=head_norm, score_threshold=0.0)
+    ).eval()
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d | FrozenNorm):
             module.running_mean.uniform_(-0.5, 0.5)

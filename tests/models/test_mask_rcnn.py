@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from torch import nn
 from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
 from torchvision.models.detection.image_list import ImageList
 from torchvision.ops import box_iou
@@ -134,13 +135,26 @@ def test_boxes_stay_inside_an_image_of_any_shape(opinionated):
             assert torch.all(found["boxes"] <= limit)
 
 
-def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter(small_config):
-    network = MaskRCNN(1, small_config)
+@pytest.mark.parametrize("head_norm", ["none", "batch"])
+def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter(small_config, head_norm):
+    network = MaskRCNN(1, dataclasses.replace(small_config, head_norm=head_norm))
     losses = network.losses(torch.rand(2, 3, 96, 128), [_target([]), _target([])])
     sum(losses.values()).backward()
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert losses["cqe"].item() == losses["mask"].item() == losses["box"].item() == 0.0
     assert all(p.grad is not None for name, p in network.cqe.named_parameters())
+    assert all(torch.isfinite(value).all() for value in network.state_dict().values())
+
+
+def test_new_norms_are_trained_beside_a_frozen_backbone(small_config):
+    network = MaskRCNN(1, dataclasses.replace(small_config, norm="frozen", head_norm="batch"))
+    trained = [name for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)]
+    assert {name.rpartition("_blocks")[0] for name in trained if "fpn" in name} == {
+        "backbone.fpn.inner",
+        "backbone.fpn.layer",
+    }
+    assert len([name for name in trained if name.startswith("roi_heads.mask_head")]) == 4
+    assert not [name for name in trained if name.startswith("backbone.body")]
 
 
 def test_a_canvas_that_is_no_multiple_of_32_is_padded(small_config):
@@ -233,7 +247,7 @@ def test_a_config_that_cannot_be_built_is_refused(change, message):
 
 
 def test_it_learns_two_pictures_and_its_quality_tells_the_truth(small_config):
-    """Overfit: after a few hundred steps both boxes are found, masks fit, and CQE's estimate is near the true IoU."""
+    """Overfit: after a hundred steps both boxes are found, masks fit, and CQE's estimate is near the true IoU."""
     torch.manual_seed(0)
     network = MaskRCNN(1, dataclasses.replace(small_config, width=0.5, fpn_channels=32, fc=64, score_threshold=0.3))
     pictures = torch.full((2, 3, 96, 128), 0.3)
@@ -242,10 +256,12 @@ def test_it_learns_two_pictures_and_its_quality_tells_the_truth(small_config):
         picture[:, y0:y1, x0:x1] = torch.tensor([0.9, 0.2, 0.1])[:, None, None]
     targets = [_target([corner]) for corner in corners]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
-    for _ in range(80):
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, total_iters=100)  # to end where it has settled
+    for _ in range(100):
         optimizer.zero_grad()
         sum(network.losses(pictures, targets).values()).backward()
         optimizer.step()
+        schedule.step()
     found = detect(network.eval(), list((pictures * 255).to(torch.uint8)))
     for result, target in zip(found, targets, strict=True):
         assert box_iou(result["boxes"][:1], target["boxes"]).item() > 0.8
