@@ -149,7 +149,7 @@ class _Beetles:
         places[:] = self._x
         places[1 : 1 + pairs] += whisker * b
         places[1 + pairs :] -= whisker * b
-        places = self._coverage.nearest(places)
+        places[1:] = self._coverage.nearest(places[1:])
         for index in self._turns(first):
             felt, every = places.take(index, axis=1), np.arange(len(index))
             f = self._f(index, felt)
@@ -247,7 +247,7 @@ class _Beetles:
         return self._coverage.iou_of(*self._edges())
 
     def iou_about(self) -> float:
-        """The same from the sum of f and the rings' areas instead of their pixels, at a tenth of the time."""
+        """The same from what f has added up to and the rings' areas, not their pixels: a fifth of the time."""
         start, end = self._edges()
         twice = float(np.vdot(start[:, 0], end[:, 1]) - np.vdot(start[:, 1], end[:, 0]))
         return self._coverage.iou_about(abs(twice) / 2, self._apart)

@@ -28,7 +28,8 @@ class Coverage:
         self._first_centre = self.low + CENTRE
         self._width, height = (self.high - self.low).astype(int).tolist()
         self._rows = height + 1  # places in a column
-        self._places = np.sort(self._crossed(start, end)[0])
+        across = np.flatnonzero(start[:, 0] != end[:, 0])  # of a traced outline half the edges run along columns
+        self._places = np.sort(self._crossed(start.take(across, axis=0), end.take(across, axis=0))[0])
         self.area = _enclosed(self._places)
         self._sign = _turn(polygons[0].outer)
 

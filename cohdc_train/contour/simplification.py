@@ -98,7 +98,7 @@ def _each_ring(polygons: Sequence[Polygon], reduce: Reduction, epsilon: float) -
 
 
 def _douglas_peucker(ring: FloatArray, epsilon: float) -> FloatArray:
-    return cv2.approxPolyDP(ring.astype(np.float32), epsilon, True).reshape(-1, 2).astype(np.float64)
+    return cv2.approxPolyDP(ring.astype(np.float32), epsilon, True)[:, 0].astype(np.float64)
 
 
 def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
