@@ -67,6 +67,25 @@ def test_beetles_of_a_turn_are_no_neighbours_and_every_beetle_gets_its_turn(size
     assert moved == set(range(sum(sizes)))
 
 
+@given(st.floats(4, 25), st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_what_f_adds_up_to_is_the_pixels_that_only_one_of_the_two_has(radius: float, seed: int) -> None:
+    """Through moves and drops, of one vertex, of several and of a whole part; counted by filling at the end."""
+    mask, rng = two_discs(radius), np.random.default_rng(seed)
+    outline = trace(mask)
+    coverage = Coverage(outline)
+    beetles = _Beetles(simplify(outline, 0.97), coverage, pairs=4)
+    for k, together in enumerate((3, 1, 2)):
+        beetles.move(2.0, (2.0, 1.0)[k % 2], k, rng)
+        choices = beetles.missed_together(together) if together > 1 else beetles.least_missed(1)
+        if choices:
+            beetles = beetles.without(*choices[0])
+    polygons = beetles.polygons()
+    if coverage.valid(polygons):
+        assert beetles._apart == (rasterize(polygons, SIZE) ^ mask).sum()
+        assert beetles.iou_about() == pytest.approx(beetles.iou(), abs=0.01)
+
+
 def test_a_small_part_goes_as_a_whole_and_a_larger_one_stays() -> None:
     """Bisection keeps the small one, as it has more than two vertices."""
     small, large = trace(two_discs(4)), trace(two_discs(12))
