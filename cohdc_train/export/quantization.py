@@ -24,6 +24,8 @@ def quantize(source: Path, target: Path, pictures: Iterable[NDArray[np.uint8]]) 
 
     uint8 activations, int8 weights per channel (QDQ), ranges by minimum and maximum over the pictures, uint8 [H, W, 3]
     RGB each. The mask predictor and the CQE head stay in float32, and so does all arithmetic on pixels and boxes.
+    Weights that are multiplied as matrices have 7 bits: on x86 without VNNI the sum of two products is kept in 16 bits,
+    and saturates with 8 of them (docs/results/int8.md). Depthwise convolutions have a way of their own there.
     """
     model = onnx.load(str(source))
     nodes = _bearing(model.graph)
@@ -38,8 +40,20 @@ def quantize(source: Path, target: Path, pictures: Iterable[NDArray[np.uint8]]) 
             per_channel=True,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
+            extra_options={"TensorQuantOverrides": _seven_bits(model.graph, nodes)},
         )
     return len(nodes)
+
+
+def _seven_bits(graph: onnx.GraphProto, nodes: list[str]) -> dict[str, list[dict[str, Any]]]:
+    """onnxruntime's options for the weights of these operators that are multiplied as matrices."""
+    overrides = {}
+    for node in graph.node:
+        attributes = {attribute.name: attribute.i for attribute in node.attribute}
+        if node.name in nodes and (node.op_type == "Gemm" or (node.op_type == "Conv" and attributes["group"] == 1)):
+            axis = 1 if node.op_type == "Gemm" and not attributes.get("transB") else 0
+            overrides[node.input[1]] = [{"axis": axis, "reduce_range": True}]
+    return overrides
 
 
 @contextmanager
