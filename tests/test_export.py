@@ -243,25 +243,6 @@ def test_int8_keeps_the_contract_and_says_what_it_scores(checkpoint, written, fo
     assert main(["export", "--verify-only", str(tmp_path / "model.int8.onnx")]) == 1
 
 
-def test_matrices_get_seven_bits_and_depthwise_weights_eight():
-    from onnx import helper
-
-    from cohdc_train.export.quantization import _seven_bits
-
-    nodes = [
-        helper.make_node("Conv", ["x", "dense"], ["a"], "dense", group=1),
-        helper.make_node("Conv", ["a", "depthwise"], ["b"], "depthwise", group=8),
-        helper.make_node("Conv", ["b", "kept"], ["c"], "in float32", group=1),
-        helper.make_node("Gemm", ["c", "rows"], ["d"], "rows", transB=1),
-        helper.make_node("Gemm", ["d", "columns"], ["e"], "columns"),
-    ]
-    graph = helper.make_graph(nodes, "graph", [], [])
-    found = _seven_bits(graph, ["dense", "depthwise", "rows", "columns"])
-    assert found == {
-        name: [{"axis": axis, "reduce_range": True}] for name, axis in (("dense", 0), ("rows", 0), ("columns", 1))
-    }
-
-
 def test_int8_that_loses_too_much_is_refused(checkpoint, written, folder, tmp_path, monkeypatch):
     scores = {"model.onnx": 0.5, "model.int8.onnx": 0.48}
 

@@ -15,7 +15,7 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from cohdc_train import signature
 
 CALIBRATION_IMAGES = 64
-_OPERATORS = ("Conv", "Gemm", "Relu", "Add", "MaxPool", "Resize")
+_OPERATORS = ("Conv", "Gemm", "Relu", "Clip", "Add", "MaxPool", "Resize")
 _FLOAT = ("mask_predictor", "cqe.")  # contours and their quality are read off these
 
 
