@@ -90,7 +90,8 @@ class Localizer:
         points, seen = self._seen(features, matches)
         moving = np.zeros(len(matches), dtype=np.bool_)
         if self._judges:
-            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing)
+            found = self.map.found[matches.points]
+            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing, found)
         else:
             T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
         if inlier.sum() < minimum:

@@ -4,6 +4,9 @@ A near thing that begins to move slowly takes the pose with it: its few points f
 far wall's many, which a small turn reconciles, so that no single residual stands out. Every group is therefore judged
 by a pose that was found without it. What lies further from there than that pose's own uncertainty and the noise of
 measurement allow, moves. The poses of all groups come from sums of the same normal equations.
+
+Which of two groups that move against each other is the world, points that have long been known decide: a person near
+the camera may hold most of the points, but has only come into view.
 """
 
 import numpy as np
@@ -24,25 +27,26 @@ from cohdc_train.slam.optimization import (
 
 _PATCHES = 24  # of neighbouring points: the leaves of the tree of groups
 _LEAST = 12  # points of a group that is judged
-_MOST = 0.6  # of all points: a larger group is the world
+_MOST = 0.6  # of all points, each as often as frames have found it: a larger group is the world
+_KNOWN = 30  # frames; a point that more have found counts no more
 _LIMIT = 16.0  # median squared distance, in standard deviations, from which a group moves
 _CLEARLY = 4.0  # times the limit: moving further counts no more than this
 _ROUNDS = 4  # groups taken out, one after the other
 
 
 def pose_of_rest(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, found: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """The pose from the points that hold together, after those that move as groups were taken out.
 
-    T_cw: [4, 4] pose from all points; points: [m, 3] world, m. Returns the pose, [m] bool inliers and [m] bool members
-    of moving groups.
+    T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more.
+    Returns the pose, [m] bool inliers and [m] bool members of moving groups.
     """
     moving = np.zeros(len(points), dtype=np.bool_)
     T_cw, inlier = optimize_pose(T_cw, points, seen, weighing)
     for _ in range(_ROUNDS):
         rest = np.flatnonzero(~moving)
-        group = moving_group(T_cw, points[rest], seen.take(rest), weighing)
+        group = moving_group(T_cw, points[rest], seen.take(rest), weighing, found[rest])
         if not group.any():
             break
         moving[rest[group]] = True
@@ -53,16 +57,19 @@ def pose_of_rest(
     return T_cw, inlier, moving
 
 
-def moving_group(T_cw: Array, points: Array, seen: Observations, weighing: Weighing) -> NDArray[np.bool_]:
-    """The group that most clearly moves against the rest. T_cw: [4, 4] best pose of all; points: [m, 3] world, m.
+def moving_group(
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, found: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """The group that most clearly moves against the rest.
 
-    Returns [m] bool, all False where everything holds together.
+    T_cw: [4, 4] best pose of all; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more. Returns
+    [m] bool, all False where everything holds together.
     """
     nothing = np.zeros(len(points), dtype=np.bool_)
     if len(points) < 3 * _LEAST:
         return nothing
     local = to_local(T_cw, points)
-    groups = nested_groups(local)
+    groups = nested_groups(local, np.minimum(found, _KNOWN))
     error = residuals(local, seen, weighing)
     J = pose_jacobian(local, residual_jacobian(local, seen, weighing))
     steps, covariances = _poses_without(groups, J, error, seen.limits)
@@ -101,8 +108,11 @@ def _poses_without(groups: NDArray[np.bool_], J: Array, error: Array, limits: Ar
     return -np.einsum("gab,gb->ga", covariances, g.sum(axis=0) - share @ g), covariances
 
 
-def nested_groups(local: Array) -> NDArray[np.bool_]:
-    """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a judgeable size."""
+def nested_groups(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a judgeable size.
+
+    counts: [m] for how many each point counts when the world is sought.
+    """
     patches, centres = _patches(local)
     groups = list(patches)
     if len(groups) > 1:
@@ -110,7 +120,8 @@ def nested_groups(local: Array) -> NDArray[np.bool_]:
             groups.append(groups[int(first)] | groups[int(second)])
     members = np.stack(groups)
     size = members.sum(axis=1)
-    return np.asarray(members[(size >= _LEAST) & (size <= _MOST * len(local))])
+    may_move = (members @ counts <= _MOST * counts.sum()) & (len(local) - size >= _LEAST)
+    return np.asarray(members[(size >= _LEAST) & may_move])
 
 
 def _patches(local: Array) -> tuple[NDArray[np.bool_], Array]:

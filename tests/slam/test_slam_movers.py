@@ -160,7 +160,7 @@ def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
     found = 0
     for seed in range(200):
         points, seen, cart = scene(seed, 0.03)
-        moving = pose_of_rest(STILL, points, seen, WEIGHING)[2]
+        moving = pose_of_rest(STILL, points, seen, WEIGHING, np.full(340, 9))[2]
         assert moving[~cart].mean() < 0.02
         found += moving[cart].mean() > 0.9
     assert found >= 198
@@ -172,7 +172,7 @@ def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shif
     dragged, inlier = optimize_pose(STILL, points, seen, WEIGHING)
     assert np.linalg.norm(dragged[:3, 3]) > shift, "the cart takes the pose along, and further than it went"
     assert inlier[~cart].mean() > 0.8, "and no residual shows it"
-    pose, inlier, moving = pose_of_rest(STILL, points, seen, WEIGHING)
+    pose, inlier, moving = pose_of_rest(STILL, points, seen, WEIGHING, np.full(340, 9))
     assert moving[cart].mean() > 0.9
     assert moving[~cart].mean() < 0.02
     assert not (inlier & moving).any()
@@ -183,12 +183,31 @@ def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shif
 def test_a_world_that_stands_still_has_no_group_that_moves(seed: int) -> None:
     points, seen, _ = scene(seed, 0.0)
     pose, _ = optimize_pose(STILL, points, seen, WEIGHING)
-    assert not moving_group(pose, points, seen, WEIGHING).any()
+    assert not moving_group(pose, points, seen, WEIGHING, np.full(340, 9)).any()
+
+
+@given(st.integers(0, 10_000), st.floats(0.06, 0.09))
+def test_of_two_groups_the_one_that_is_long_known_is_the_world(seed: int, shift: float) -> None:
+    """A person close by holds three quarters of the points, but few frames have found them."""
+    rng = np.random.default_rng(seed)
+    wall = rng.uniform([-1.8, -1.3, 3.0], [1.8, 1.3, 4.0], (100, 3))
+    person = rng.uniform([-0.4, -0.6, 0.9], [0.3, 0.6, 1.2], (300, 3))
+    points, walks = np.concatenate([wall, person]), np.arange(400) >= 100
+    local = points + walks[:, None] * np.array([shift, 0, 0])
+    pixels = CAMERA.project(local) + rng.normal(0, 0.5, (400, 2))
+    seen = Observations(pixels, local[:, 2] + rng.normal(0, 0.003, 400) * local[:, 2] ** 2, np.ones(400))
+    dragged, _ = optimize_pose(STILL, points, seen, WEIGHING)
+    assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift, "most points are the person's"
+    pose, _, moving = pose_of_rest(STILL, points, seen, WEIGHING, np.where(walks, 5, 100))
+    assert np.linalg.norm(pose[:3, 3]) < 0.5 * shift
+    assert moving[walks].mean() > 0.9
+    followed, _, _ = pose_of_rest(STILL, points, seen, WEIGHING, np.full(400, 5))
+    assert np.linalg.norm(followed[:3, 3]) > 0.5 * shift, "of points that are as long known the most are the world"
 
 
 def test_few_points_are_not_judged() -> None:
     points, seen, _ = scene(0, 0.02)
-    assert not moving_group(STILL, points[-20:], seen.take(np.arange(320, 340)), WEIGHING).any()
+    assert not moving_group(STILL, points[-20:], seen.take(np.arange(320, 340)), WEIGHING, np.full(20, 9)).any()
 
 
 def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() -> None:
