@@ -50,7 +50,8 @@ def _seven_bits(graph: onnx.GraphProto, nodes: list[str]) -> dict[str, list[dict
     overrides = {}
     for node in graph.node:
         attributes = {attribute.name: attribute.i for attribute in node.attribute}
-        if node.name in nodes and (node.op_type == "Gemm" or (node.op_type == "Conv" and attributes.get("group", 1) == 1)):
+        dense = node.op_type == "Gemm" or (node.op_type == "Conv" and attributes.get("group", 1) == 1)
+        if dense and node.name in nodes:
             axis = 1 if node.op_type == "Gemm" and not attributes.get("transB") else 0
             overrides[node.input[1]] = [{"axis": axis, "reduce_range": True}]
     return overrides
