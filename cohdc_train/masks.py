@@ -4,8 +4,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Window = tuple[NDArray[np.bool_], tuple[int, int]]
-
 
 def paste_roi_mask(
     roi_mask: NDArray[np.float32], box: NDArray[np.float32], size: tuple[int, int], threshold: float = 0.5
@@ -19,7 +17,7 @@ def paste_roi_mask(
 
 def roi_window(
     roi_mask: NDArray[np.float32], box: NDArray[np.float32], size: tuple[int, int], threshold: float = 0.5
-) -> Window:
+) -> tuple[NDArray[np.bool_], tuple[int, int]]:
     """The part of the image's mask that lies in the box: [h, w] bool, and (row, column) of its first pixel.
 
     roi_mask: [M, M] probability; box: [4] xyxy, px; size: (height, width) of the image, px.

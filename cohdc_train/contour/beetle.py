@@ -96,7 +96,7 @@ class _Beetles:
         self._sizes = np.array([len(ring) for ring in rings])
         self._x = np.concatenate(rings)  # [V, 2]
         self._link()
-        self._apart = coverage.apart(*self._edges())
+        _, self._apart = coverage.counts(*self._edges())
 
     def _link(self) -> None:
         """Neighbours of every vertex, its place in its ring and the ring's size."""

@@ -40,19 +40,19 @@ class Coverage:
 
     def iou_of(self, start: FloatArray, end: FloatArray) -> float:
         """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
+        return self.iou_about(*self.counts(start, end))
+
+    def counts(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
+        """Pixels that closed rings cover, and that only they or the outline have; edges [E, 2] -> [E, 2]."""
         places = self._crossed(start, end)[0]
         both = np.concatenate((self._places, places))
         places.sort()
         both.sort()
-        return self.iou_about(_enclosed(places), _enclosed(both))
+        return _enclosed(places), _enclosed(both)
 
     def iou_about(self, covered: float, apart: int) -> float:
         """IoU of what covers so many pixels, so many of which only one of it and the outline has."""
         return (self.area + covered - apart) / (self.area + covered + apart)
-
-    def apart(self, start: FloatArray, end: FloatArray) -> int:
-        """Pixels that only one of the outline and closed rings has, which are given as edges [E, 2] -> [E, 2]."""
-        return _enclosed(np.sort(np.concatenate((self._places, self._crossed(start, end)[0]))))
 
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
         """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].

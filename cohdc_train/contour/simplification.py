@@ -17,7 +17,7 @@ Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
 METHODS: tuple[Method, ...] = get_args(Method)
 Reduction = Callable[[FloatArray, float], FloatArray]
 
-_EVALUATIONS = 9  # of a tolerance at most; four or five do
+_EVALUATIONS = 9  # of a tolerance at most; three or four do
 _FINEST, _COARSEST = 0.25, 0.1  # tolerances looked at: px, and a share of the outline's diagonal
 _FINER = 0.9
 _LOST = 0.175  # area lost per px of tolerance and px of outline, about
