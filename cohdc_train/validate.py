@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from lightning.pytorch import Trainer
 
+from cohdc_train.allocator import keep_freed_memory
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoSplit
 from cohdc_train.data.datamodule import CocoDataModule
@@ -51,6 +52,7 @@ def validate(
     Raises:
         CohdcError: the model, the folder or their classes cannot be used.
     """
+    keep_freed_memory()
     model = model_path(model)
     if model.suffix == ".onnx":
         if canvas is not None:

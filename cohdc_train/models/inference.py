@@ -72,7 +72,7 @@ def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> Padd
     limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
     proposals = _propose(network, list(pyramid.values()), limit)
     # RoIAlign reads channels first, and would copy every level each time it is called
-    levels = [pyramid[name].contiguous() for name in network.config.roi_levels()]
+    levels = [pyramid[name].float().contiguous() for name in network.config.roi_levels()]
     boxes, labels, scores, count = _classify(network, levels, proposals, limit)
     masks, quality = _segment(network, levels, boxes, labels, count)
     return PaddedDetections(boxes, labels, scores, quality, masks, count)

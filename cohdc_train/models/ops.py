@@ -30,7 +30,7 @@ def letterbox(images: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
     """
     height, width = images.shape[1:3]
     size = fitted_size(height, width, (rows, columns))
-    x = images.permute(0, 3, 1, 2).float()
+    x = images.permute(0, 3, 1, 2).contiguous().float()
     x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True) / 255
     geometry = torch.tensor([size[0], size[1], height / size[0], width / size[1]], device=images.device)
     return F.pad(x, (0, columns - size[1], 0, rows - size[0])).contiguous(), geometry

@@ -13,6 +13,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_info
 
+from cohdc_train.allocator import keep_freed_memory
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path
@@ -42,6 +43,7 @@ def fit(args: list[str]) -> Trainer:
     `pictures/` (of best.ckpt; `pictures/last/` of the last validation; none with `--pictures false`).
     Raises CohdcError in one line for whatever the user can mend; a wrong key ends the program with code 2.
     """
+    keep_freed_memory()
     with told_in_one_line():
         command = FitCommand(
             MaskRCNNModule,

@@ -27,9 +27,10 @@ def window_rle(window: NDArray[np.bool_], corner: tuple[int, int], size: tuple[i
     """
     (height, width), (top, left) = size, corner
     rows = window.shape[0]
-    columns = np.zeros((window.shape[1], rows + 2), np.int8)  # a pixel more at both ends, so that no run leaves it
+    columns = np.zeros((window.shape[1], rows + 2), np.bool_)  # a pixel more at both ends, so that no run leaves it
     columns[:, 1:-1] = window.T
-    column, row = np.divmod(np.flatnonzero(np.diff(columns.ravel())) + 1, rows + 2)
+    pixels = columns.ravel()
+    column, row = np.divmod(np.flatnonzero(pixels[1:] != pixels[:-1]) + 1, rows + 2)
     ends = (left + column) * height + top + row - 1  # where runs begin and end, by turns
     goes_on = np.flatnonzero(ends[1:-1:2] == ends[2::2])  # from the last pixel of a column to the first of the next
     ends = np.delete(ends, np.concatenate([2 * goes_on + 1, 2 * goes_on + 2]))
