@@ -79,7 +79,7 @@ class Tracker:
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
-        self._velocity = np.eye(4)  # T_cw of the last frame times the inverse of the one's before
+        self._velocity = np.zeros(6)  # logarithm of the last frame's T_cw times the inverse of the one's before
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
@@ -170,7 +170,7 @@ class Tracker:
         if self._last is None or len(self._log) < 2:
             return None
         step = self._log[-1][0] - self._log[-2][0]
-        return log_se3(self._velocity) / step if 0 < step <= _LONGEST else None
+        return self._velocity / step if 0 < step <= _LONGEST else None
 
     def _motion(self, t: float) -> Array:
         """[4, 4] T_cw to be expected at t times the inverse of the last one: constant velocity, however long it took.
@@ -178,11 +178,11 @@ class Tracker:
         After a pause the camera is held to have gone on for as long as its velocity is known to say something.
         """
         if len(self._log) < 2:
-            return self._velocity
+            return exp_se3(self._velocity)
         last = self._log[-1][0]
         step = last - self._log[-2][0]
         share = min(t - last, max(step, _LONGEST)) / step if step > 0 else 1.0
-        return exp_se3(share * log_se3(self._velocity))
+        return exp_se3(share * self._velocity)
 
     def _locate(self, features: Features, rgb: NDArray[np.uint8], t: float) -> Fit | None:
         if not self.map.keyframes:
@@ -246,9 +246,9 @@ class Tracker:
     def _remember(self, fit: Fit | None, t: float) -> None:
         if fit is None or fit.reference is None:
             self._last = None
-            self._velocity = np.eye(4)
+            self._velocity = np.zeros(6)
             return
-        self._velocity = np.eye(4) if self._last is None else fit.T_cw @ inverse(self._last.T_cw)
+        self._velocity = np.zeros(6) if self._last is None else log_se3(fit.T_cw @ inverse(self._last.T_cw))
         self._last = fit
         if self._since_keyframe > 0:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
