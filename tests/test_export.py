@@ -19,7 +19,7 @@ from cohdc_train.errors import CohdcError, ContractError, ExportError
 from cohdc_train.export import command, export, parity
 from cohdc_train.export.graph import count_flops
 from cohdc_train.export.pictures import drawn_images
-from cohdc_train.models import MaskRCNN, detect
+from cohdc_train.models import Detector, MaskRCNN, detect
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule
 
@@ -188,6 +188,25 @@ def test_wrong_masks_and_other_detections_are_seen(opinionated, exported):
     other.roi_heads.box_predictor.cls_score.weight.data.mul_(3)
     with pytest.raises(ExportError, match="finds other objects than torch"):
         parity.compare(other, exported, pictures).require(exported)
+
+
+def test_pictures_that_hinge_on_rounding_decide_nothing_and_are_few(opinionated):
+    """A network whose threshold is the score of something it finds differs from itself, an ordinary one does not."""
+    (picture,) = drawn_images(1)
+
+    def found_by(network):
+        with torch.inference_mode():
+            return [tensor.numpy()[0] for tensor in Detector(network)(torch.from_numpy(picture)[None])]
+
+    found = found_by(opinionated)
+    assert not parity._hinges_on_rounding(opinionated, picture, found)
+    edge = copy.deepcopy(opinionated)
+    edge.config = dataclasses.replace(edge.config, score_threshold=float(found[2][int(found[-1]) - 1]))
+    assert parity._hinges_on_rounding(edge, picture, found_by(edge))
+    few = parity.Parity(images=7) | parity.Parity(images=1, undecided=1)
+    few.require("m.onnx")
+    with pytest.raises(ExportError, match=r"m\.onnx: what torch finds hinges on rounding in 3 of 10 images"):
+        (few | parity.Parity(images=2, undecided=2)).require("m.onnx")
 
 
 def test_verify_only_finds_the_checkpoint_and_sees_that_it_changed(checkpoint, exported, tmp_path, capsys):

@@ -101,7 +101,7 @@ def _exported(
     there = all(path.is_file() for path in (kept, file, *([small] if int8 else [])))
     if not (there and json.loads(kept.read_text()) == {"checkpoint": digest, "int8": int8}):
         images = CocoDataModule(data).folder.train[0].images[0].path.parent
-        export(trained.checkpoint, file, int8=images if int8 else None, allow_drop=True)
+        export(trained.checkpoint, file, images=images, int8=images if int8 else None, allow_drop=True)
         write_json(kept, {"checkpoint": digest, "int8": int8})
     files = {"fps_ort": file} | ({"fps_ort_int8": small} if int8 else {})
     seconds = None if seed is None else trained.seconds

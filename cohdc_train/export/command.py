@@ -130,6 +130,8 @@ def _describe(target: Path, report: dict[str, Any]) -> str:
         f"{target}: equals torch on {len(report['cases'])} cases with {report['detections_compared']} detections, "
         f"{report['most_detections']} in one image (largest difference: {worst}; mask IoU {report['mask_iou_min']:.4f})"
     )
+    if report["images_undecided"]:
+        text += f"; {report['images_undecided']} of {report['images']} images hinge on rounding in torch, too"
     if "nodes" in report:
         text += (
             f"\n{report['bytes'] / 1e6:.1f} MB, {report['nodes']} nodes, opset {report['opset']}, "
