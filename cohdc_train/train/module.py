@@ -96,7 +96,7 @@ class MaskRCNNModule(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """Begin new scores, of the weights as they are (the averaged ones, where they are scored)."""
-        self._fused = [fused(self.network, torch.bfloat16 if self.trainer.precision == "bf16-mixed" else torch.float32)]
+        self._fused = [fused(self.network, torch.bfloat16 if self.trainer.precision == "bf16-mixed" else None)]
         truth = self._data().val_ground_truth
         if self._metrics is None or self._metrics.ground_truth is not truth:
             self._metrics = SegmentationMetrics(truth)
