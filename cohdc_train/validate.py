@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from lightning.pytorch import Trainer
 
-from cohdc_train.allocator import keep_freed_memory
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoSplit
 from cohdc_train.data.datamodule import CocoDataModule
@@ -15,6 +14,7 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Segmenter
+from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.cli import told_in_one_line
 from cohdc_train.train.metrics import Results, SegmentationMetrics, category_names
 from cohdc_train.train.module import MaskRCNNModule

@@ -1,4 +1,4 @@
-"""tools/tum_benchmark: finds the sequences below a folder, linked ones too, runs each once, and writes rows and tables."""
+"""tools/tum_benchmark: finds the sequences below a folder, linked ones too, runs each once, writes rows and tables."""
 
 import json
 import subprocess

@@ -13,10 +13,10 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_info
 
-from cohdc_train.allocator import keep_freed_memory
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path
+from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.ema import ema
 from cohdc_train.train.module import MaskRCNNModule

@@ -6,7 +6,7 @@ from pathlib import Path
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import converted, drawn, file_names, image_of, iou, masks_of, refused
+from conversion import converted, drawn, file_names, image_of, masks_of, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -87,8 +87,10 @@ def test_yolo_polygons_come_back(height: int, width: int, centre: tuple[float, f
     np.testing.assert_allclose(np.reshape(found.segmentation, (-1, 2)), exact, atol=1e-3)
     mask = found.mask(height, width)
     assert (mask == drawn(found.segmentation[0], size=(height, width))).all()
-    if mask.sum() > 400:  # of fewer pixels, the three or so whose rounding falls the other way weigh more
-        assert iou(mask, drawn(exact.ravel().tolist(), size=(height, width))) > 0.97
+    # pycocotools puts corners on a grid of a fifth of a pixel: one rounded the other way moves an edge by so much
+    perimeter = float(np.linalg.norm(exact - np.roll(exact, -1, axis=0), axis=1).sum())
+    changed = np.count_nonzero(mask != drawn(exact.ravel().tolist(), size=(height, width)))
+    assert changed <= 0.2 * np.sqrt(2) * perimeter + 3
 
 
 YOLO_ERRORS = {
