@@ -177,7 +177,7 @@ def _write(out: Path, table: Sequence[Row], said: str) -> None:
 
 
 def plot(table: Sequence[Row]) -> bytes:
-    """Mask AP over frames per second as a PNG; float32 and int8 of a network are joined."""
+    """Mask AP over frames per second as a PNG, with their ranges; float32 and int8 of a network are joined."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -185,16 +185,28 @@ def plot(table: Sequence[Row]) -> bytes:
     axes = figure.add_subplot()
     for i, row in enumerate(table):
         pairs = (("fps_ort", "ap", "o"), ("fps_ort_int8", "ap_int8", "s"))
-        points = [(row[x], row[y], m) for x, y, m in pairs if row[x] is not None and row[y] is not None]
-        axes.plot([x for x, _, _ in points], [y for _, y, _ in points], color=f"C{i % 10}", linewidth=1)
+        points = [(x, y, m) for x, y, m in pairs if row[x] is not None and row[y] is not None]
+        color = f"C{i % 10}"
+        axes.plot([row[x] for x, _, _ in points], [row[y] for _, y, _ in points], color=color, linewidth=1)
         for x, y, marker in points:
-            axes.plot(x, y, marker, color=f"C{i % 10}")
+            errors = _either_way(row, y), _either_way(row, x)
+            axes.errorbar(row[x], row[y], *errors, fmt=marker, color=color, elinewidth=0.7, capsize=2)
         if points:
-            axes.annotate(row["name"], points[0][:2], xytext=(5, 5), textcoords="offset points", fontsize=8)
+            place = row[points[0][0]], row[points[0][1]]
+            axes.annotate(row["name"], place, xytext=(5, 5), textcoords="offset points", fontsize=8)
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
+    axes.margins(0.15)
     axes.set_xlabel("frames per second, image to masks (circle float32, square int8; onnxruntime)")
     axes.set_ylabel("mask AP")
     axes.grid(alpha=0.3)
     stream = io.BytesIO()
     FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
     return stream.getvalue()
+
+
+def _either_way(row: Row, name: str) -> list[list[float]]:
+    """[[below], [above]] of a column's median in a row: how far its range reaches, 0 where it has none."""
+    low, high = (row[name] if end is None else end for end in row["ranges"].get(name, (None, None)))
+    return [[row[name] - low], [high - row[name]]]
