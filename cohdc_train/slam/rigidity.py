@@ -26,7 +26,7 @@ from cohdc_train.slam.optimization import (
 )
 
 _PATCHES = 24  # of neighbouring points: the leaves of the tree of groups
-_LEAST = 12  # points of a group that is judged
+_LEAST = 8  # points of a group that is judged: fewer than ten near ones have carried the pose along
 _MOST = 0.6  # of all points, each as often as frames have found it: a larger group is the world
 _KNOWN = 30  # frames; a point that more have found counts no more
 _LIMIT = 16.0  # median squared distance, in standard deviations, from which a group moves
