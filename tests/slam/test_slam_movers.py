@@ -181,7 +181,7 @@ def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shif
 
 @given(st.integers(0, 10_000), st.floats(0.04, 0.09))
 def test_nine_near_points_do_not_take_the_pose_along(seed: int, shift: float) -> None:
-    """What a mask has missed of a passer-by, before 300 far points that nearly agree with a pose wrong by centimetres."""
+    """What a mask has missed of a passer-by, before 300 far points that agree with a pose wrong by centimetres."""
     points, seen, cart = scene(seed, shift)
     points, seen, cart = points[:309], seen.take(np.arange(309)), cart[:309]
     dragged, _ = optimize_pose(STILL, points, seen, WEIGHING)
