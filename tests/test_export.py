@@ -194,14 +194,15 @@ def test_pictures_that_hinge_on_rounding_decide_nothing_and_are_few(opinionated)
     """A network whose threshold is the score of something it finds differs from itself, an ordinary one does not."""
     (picture,) = drawn_images(1)
 
-    def found_by(network):
+    def found_by(detector):
         with torch.inference_mode():
-            return [tensor.numpy()[0] for tensor in Detector(network)(torch.from_numpy(picture)[None])]
+            return [tensor.numpy()[0] for tensor in detector(torch.from_numpy(picture)[None])]
 
-    found = found_by(opinionated)
-    assert not parity._hinges_on_rounding(opinionated, picture, found)
-    edge = copy.deepcopy(opinionated)
-    edge.config = dataclasses.replace(edge.config, score_threshold=float(found[2][int(found[-1]) - 1]))
+    sure, edge = Detector(opinionated), Detector(copy.deepcopy(opinionated))
+    found = found_by(sure)
+    assert not parity._hinges_on_rounding(sure, picture, found)
+    at = float(found[2][int(found[-1]) - 1])
+    edge.network.config = dataclasses.replace(opinionated.config, score_threshold=at)
     assert parity._hinges_on_rounding(edge, picture, found_by(edge))
     few = parity.Parity(images=7) | parity.Parity(images=1, undecided=1)
     few.require("m.onnx")

@@ -20,7 +20,6 @@ from cohdc_train import signature
 from cohdc_train.errors import ExportError
 from cohdc_train.masks import paste_roi_mask
 from cohdc_train.models import Detector, MaskRCNN
-from cohdc_train.models.inference import detect_on_canvas
 from cohdc_train.models.ops import letterbox
 from cohdc_train.segmenter.session import open_session
 
@@ -109,7 +108,7 @@ def compare(network: MaskRCNN, path: Path, pictures: Sequence[Image]) -> Parity:
         for i, image in enumerate(batch):
             truth = [e[i] for e in expected]
             found = _difference(truth, [a[i] for a in actual], image.shape[:2])
-            if found.problem() is not None and _hinges_on_rounding(network, image, truth):
+            if found.problem() is not None and _hinges_on_rounding(detector, image, truth):
                 found = Parity(images=1, undecided=1)
             parity |= found
         counts = expected[-1].tolist()
@@ -117,19 +116,17 @@ def compare(network: MaskRCNN, path: Path, pictures: Sequence[Image]) -> Parity:
     return parity
 
 
-def _hinges_on_rounding(network: MaskRCNN, image: Image, expected: list[NDArray[Any]]) -> bool:
+def _hinges_on_rounding(detector: Detector, image: Image, expected: list[NDArray[Any]]) -> bool:
     """Whether the network finds something else in an image [H, W, 3] by itself, without those it shared a batch with,
     or changed by up to a 400th of a grey level."""
-    canvas, geometry = letterbox(torch.from_numpy(image)[None], *network.config.canvas)
+    canvas, geometry = letterbox(torch.from_numpy(image)[None], *detector.network.config.canvas)
     generator = torch.Generator().manual_seed(0)
     for disturbance in _DISTURBANCES:
         noise = disturbance * (2 * torch.rand(canvas.shape, generator=generator) - 1)
         with torch.inference_mode():
-            found = detect_on_canvas(network, canvas + noise, geometry[None, :2])
-        scale = geometry[[3, 2, 3, 2]]
-        boxes, labels, count = (found.boxes[0] * scale).numpy(), found.labels[0].numpy(), found.count[0].numpy()
-        pairs = _pairs(expected, [boxes, labels, count])
-        if pairs is None or any(np.abs(expected[0][i] - boxes[j]).max() > 1.0 for i, j in pairs):
+            found = [tensor[0].numpy() for tensor in detector.on_canvas(canvas + noise, geometry)]
+        pairs = _pairs(expected, found)
+        if pairs is None or any(np.abs(expected[0][i] - found[0][j]).max() > 1.0 for i, j in pairs):
             return True
     return False
 
@@ -173,10 +170,7 @@ def _difference(expected: list[NDArray[Any]], actual: list[NDArray[Any]], size: 
 
 
 def _pairs(expected: list[NDArray[Any]], actual: list[NDArray[Any]]) -> list[tuple[int, int]] | None:
-    """Rows of the same detection on both sides; None where the detections are not the same.
-
-    expected, actual: outputs of one image, of which boxes and labels, the first two, and the count, the last, are read.
-    """
+    """Rows of the same detection on both sides; None where the detections are not the same."""
     (boxes, labels), (other_boxes, other_labels) = expected[:2], actual[:2]
     count = int(expected[-1])
     if int(actual[-1]) != count:

@@ -39,9 +39,11 @@ class Detector(torch.nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         """images: uint8 [B, H, W, 3] RGB, any H and W. Rows of the result fall by score."""
-        rows, columns = self.network.config.canvas
-        canvas, geometry = letterbox(images, rows, columns)
-        found = detect_on_canvas(self.network, canvas, geometry[None, :2].expand(images.shape[0], 2))
+        return self.on_canvas(*letterbox(images, *self.network.config.canvas))
+
+    def on_canvas(self, canvas: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
+        """The same of what `letterbox` has made of them."""
+        found = detect_on_canvas(self.network, canvas, geometry[None, :2].expand(canvas.shape[0], 2))
         boxes = found.boxes * torch.stack([geometry[3], geometry[2], geometry[3], geometry[2]])
         return boxes, found.labels, found.scores, found.quality, found.masks, found.count
 
