@@ -37,7 +37,7 @@ def bench(
         weights: row -> ImageNet weights, by torchvision's name or as a file. Rows without start from random weights.
         options: further arguments of `cohdc fit` for all rows, such as '["--data.canvas=[240,320]"]'.
         epochs: budget of each training.
-        train_minutes: the budget as time instead, at a constant learning rate.
+        train_minutes: the budget as time instead; the learning rate falls with it.
         seeds: one training of every row for each; [0] when left out.
         threads: of training, torch and onnxruntime.
         images: validation pictures that are timed.
@@ -76,6 +76,5 @@ def _fit_options(
     if train_minutes is not None:
         seconds = round(60 * train_minutes)
         clock = f"00:{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}"
-        endless = ("--trainer.max_epochs=100000", "--model.optimizer.final_fraction=1")
-        return (*given, *options, f"--trainer.max_time={clock}", *endless)
+        return (*given, *options, f"--trainer.max_time={clock}", "--trainer.max_epochs=-1")
     return (*given, *options, f"--trainer.max_epochs={epochs}")

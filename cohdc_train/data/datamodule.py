@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, cast
 import cv2
 import lightning.pytorch as pl
 import torch
+from kornia.augmentation import IntensityAugmentationBase2D
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
@@ -180,6 +181,8 @@ class CocoDataModule(pl.LightningDataModule):
             return batch
         images = batch.images.float() / 255
         if self._photometric is not None:
+            for step in self._photometric.children():  # kornia would draw a whole batch of noise on the CPU
+                cast(IntensityAugmentationBase2D, step).set_rng_device_and_dtype(images.device, images.dtype)
             with torch.autocast(images.device.type, enabled=False):
                 images = cast(Tensor, self._photometric(images)).clamp(0, 1)
             images = blank_padding(images, [target["size"] for target in batch.targets])

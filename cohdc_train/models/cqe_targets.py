@@ -1,6 +1,7 @@
 """What the CQE head regresses: how well a predicted mask covers its whole ground-truth mask (paper 2.1.2)."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -15,19 +16,19 @@ BAND = 0.02  # width of Boundary IoU's band, as a share of the image's diagonal
 
 @torch.no_grad()
 def cqe_targets(
-    masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, kind: Goal = "iou", band: int = 1
+    masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, kind: Goal = "iou", bands: Sequence[int] = ()
 ) -> Tensor:
     """How well each predicted mask covers its whole ground-truth mask, also what of it lies outside the box.
 
-    masks: [K, M, M] probabilities; boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object; band: px.
-    Returns [K] in 0..1:
+    masks: [K, M, M] probabilities; boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object; bands: px,
+    of each, for the last two kinds. Returns [K] in 0..1:
     - "iou": mask IoU, counted on the box's M x M grid, in whose cells the whole object's area is expressed too;
     - "ciou": (1 + CIoU) / 2 clipped, the paper's S_iou, and 0 where the masks do not meet;
     - "boundary_iou": IoU of the two masks' inner bands (Cheng et al. 2021), on canvas px;
     - "min": the smaller of mask IoU and Boundary IoU, both on canvas px: what Boundary AP matches by.
     """
     if kind in ("boundary_iou", "min"):
-        return _on_canvas(masks, boxes, truth, matched, kind == "min", band)
+        return _on_canvas(masks, boxes, truth, matched, kind == "min", bands)
     side = masks.shape[-1]
     inside = (truth.within(boxes, matched, (side, side)) >= 0.5).to(boxes.dtype)
     predicted = (masks > 0.5).to(boxes.dtype)
@@ -68,11 +69,13 @@ def _iou(a: Tensor, b: Tensor) -> Tensor:
     return (a & b).sum() / (a | b).sum().clamp(min=1)
 
 
-def _on_canvas(masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, lesser: bool, band: int) -> Tensor:
+def _on_canvas(
+    masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, lesser: bool, bands: Sequence[int]
+) -> Tensor:
     """[K] Boundary IoU, or with `lesser` the smaller of it and mask IoU, pixel by pixel around both masks."""
     shapes = Shape.of(truth.rasters.to(boxes.dtype)).placed(truth.cells(), truth.frames[:, :2])
     scores = boxes.new_zeros(len(boxes))
-    for k, (mask, box, g) in enumerate(zip(masks, boxes, matched, strict=True)):
+    for k, (mask, box, g, band) in enumerate(zip(masks, boxes, matched, bands, strict=True)):
         low = torch.minimum(box[:2], shapes.low[g]).floor()
         high = torch.maximum(box[2:], shapes.high[g]).ceil()
         width, height = (int(v) for v in (high - low).clamp(min=1))

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from cohdc_train.models.mask_rcnn import MaskRCNN
 from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels, rows_to_segment
+from cohdc_train.models.rpn import decode, is_solid
 
-_RPN_NMS_IOU = 0.7
 _CANDIDATES = 1000  # best (proposal, class) pairs that enter the last suppression
-_MIN_SIDE = 1e-2  # px on the canvas; smaller boxes hold nothing
 
 
 @dataclass(frozen=True)
@@ -72,32 +71,13 @@ def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> Padd
     """canvas: float [B, 3, H, W] in 0..1; content: [B, 2] height and width in px of what is not padding."""
     pyramid = network.features(canvas)
     limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
-    proposals = _propose(network, list(pyramid.values()), limit)
+    objectness, deltas = network.rpn.head(list(pyramid.values()))
+    proposals = network.rpn.propose(objectness, deltas, network.config.proposals[1], limit)
     # RoIAlign reads channels first, and would copy every level each time it is called
     levels = [pyramid[name].float().contiguous() for name in network.config.roi_levels()]
     boxes, labels, scores, count = _classify(network, levels, proposals, limit)
     masks, quality = _segment(network, levels, boxes, labels, count)
     return PaddedDetections(boxes, labels, scores, quality, masks, count)
-
-
-def _propose(network: MaskRCNN, features: list[Tensor], limit: Tensor) -> Tensor:
-    """[B, R, 4] proposals, canvas px; rows without one are zero boxes."""
-    rpn, wanted = network.rpn, network.config.proposals[1]
-    objectness, deltas = rpn.head(features)
-    boxes, scores = [], []
-    for level, (logits, delta) in enumerate(zip(objectness, deltas, strict=True)):
-        score, index = _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
-        stride = network.config.finest_stride * 2**level
-        anchors = _anchors(rpn.anchor_generator.cell_anchors[level].to(logits.device), index, logits.shape[3], stride)
-        delta = _flatten(delta, 4).gather(1, index[:, :, None].expand(-1, -1, 4))
-        box = _decode(delta.float(), anchors, (1.0, 1.0, 1.0, 1.0), limit)
-        score = torch.where(_is_solid(box), score.float().sigmoid(), 0.0)
-        score = torch.where(nms_keep(box, score, _RPN_NMS_IOU, 0.0), score, 0.0)
-        boxes.append(box)
-        scores.append(score)
-    score, index = torch.cat(scores, dim=1).topk(min(wanted, sum(s.shape[1] for s in scores)), dim=1)
-    box = torch.cat(boxes, dim=1).gather(1, index[:, :, None].expand(-1, -1, 4))
-    return box * (score > 0)[:, :, None]
 
 
 def _classify(
@@ -112,12 +92,12 @@ def _classify(
     classes = network.num_classes
     scores = logits.float().softmax(dim=1)[:, 1:].reshape(batch, rois * classes)
     deltas = deltas.float().reshape(batch, rois * (classes + 1), 4)
-    solid = _is_solid(proposals)[:, :, None].expand(batch, rois, classes).reshape(batch, rois * classes)
+    solid = is_solid(proposals)[:, :, None].expand(batch, rois, classes).reshape(batch, rois * classes)
     scores, index = torch.where(solid, scores, 0.0).topk(min(_CANDIDATES, rois * classes), dim=1)
     roi, label = index // classes, index % classes
     deltas = deltas.gather(1, (roi * (classes + 1) + label + 1)[:, :, None].expand(-1, -1, 4))
-    boxes = _decode(deltas, proposals.gather(1, roi[:, :, None].expand(-1, -1, 4)), heads.box_coder.weights, limit)
-    scores = torch.where(_is_solid(boxes), scores, 0.0)
+    boxes = decode(deltas, proposals.gather(1, roi[:, :, None].expand(-1, -1, 4)), heads.box_coder.weights, limit)
+    scores = torch.where(is_solid(boxes), scores, 0.0)
     apart = label.float() * (max(config.canvas) + 1.0)  # no two classes overlap
     keep = nms_keep(boxes + apart[:, :, None], scores, config.nms_iou, config.score_threshold)
     scores, best = torch.where(keep, scores, 0.0).topk(min(config.detections, scores.shape[1]), dim=1)
@@ -145,36 +125,3 @@ def _segment(
         return padded, present.float()
     quality = network.cqe(pooled, masks).gather(1, label[:, None])[:, 0].float().clamp(0.0, 1.0)
     return padded, quality.new_zeros((batch * n,)).index_put((rows,), quality).reshape(batch, n) * present
-
-
-def _flatten(maps: Tensor, values: int) -> Tensor:
-    """[B, A * values, H, W] -> [B, H * W * A, values]: the order of torchvision's anchors."""
-    batch, channels, height, width = maps.shape
-    return (
-        maps.reshape(batch, channels // values, values, height, width)
-        .permute(0, 3, 4, 1, 2)
-        .reshape(batch, height * width * (channels // values), values)
-    )
-
-
-def _anchors(cell: Tensor, index: Tensor, width: int, stride: int) -> Tensor:
-    """[B, k, 4] anchors at flat positions: cell is [A, 4], index counts anchors fastest, then columns, then rows."""
-    shapes = cell.shape[0]
-    x, y = (index // shapes) % width * stride, index // (shapes * width) * stride
-    return cell[index % shapes] + torch.stack([x, y, x, y], dim=2)
-
-
-def _decode(deltas: Tensor, boxes: Tensor, weights: tuple[float, ...], limit: Tensor) -> Tensor:
-    """Box deltas [B, n, 4] applied to boxes [B, n, 4] and clipped to limit [B, 1, 4] (R-CNN's parametrisation)."""
-    size = boxes[:, :, 2:] - boxes[:, :, :2]
-    centre = boxes[:, :, :2] + 0.5 * size
-    shift = deltas * deltas.new_tensor([1.0 / weight for weight in weights])
-    centre = centre + shift[:, :, :2] * size
-    half = 0.5 * torch.exp(shift[:, :, 2:].clamp(max=4.135)) * size  # at most 1000 / 16 times as large
-    corners = torch.cat([centre - half, centre + half], dim=2)
-    return torch.minimum(corners.clamp(min=0.0), limit)
-
-
-def _is_solid(boxes: Tensor) -> Tensor:
-    """[B, n] bool: both sides of the box are long enough to hold something."""
-    return ((boxes[:, :, 2:] - boxes[:, :, :2]) >= _MIN_SIDE).all(dim=2)

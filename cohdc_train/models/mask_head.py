@@ -1,10 +1,8 @@
 """The mask head's end, 28 or 56 cells a side, and its loss."""
 
 from collections import OrderedDict
-from collections.abc import Sequence
 from typing import Literal
 
-import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from torchvision.models.detection.mask_rcnn import MaskRCNNPredictor
@@ -26,14 +24,13 @@ def mask_predictor(channels: int, classes: int, side: MaskSize) -> nn.Sequential
     return nn.Sequential(OrderedDict(**layers, conv6_mask=again, relu6=nn.ReLU(inplace=True), mask_fcn_logits=last))
 
 
-def mask_loss(logits: Tensor, per_image: Sequence[tuple[TrueMasks, Tensor, Tensor]]) -> Tensor:
+def mask_loss(logits: Tensor, truth: TrueMasks, boxes: Tensor, matched: Tensor) -> Tensor:
     """Binary cross-entropy of masks [K, M, M] (logits) with the share of every cell that the object covers.
 
-    per_image: truth, boxes [k, 4] and matched objects [k] of each image, in the order of the masks. The targets are
-    soft and lie on the grid by which masks are pasted; Matterport's are rounded, torchvision's half a pixel off.
+    boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object. The targets are soft and lie on the grid by
+    which masks are pasted; Matterport's are rounded, torchvision's half a pixel off.
     """
-    size = (logits.shape[-2], logits.shape[-1])
-    covered = [truth.within(boxes, matched, size) for truth, boxes, matched in per_image if len(boxes)]
-    if not covered:
+    if not len(boxes):
         return logits.sum() * 0
-    return F.binary_cross_entropy_with_logits(logits, torch.cat(covered))
+    covered = truth.within(boxes, matched, (logits.shape[-2], logits.shape[-1]))
+    return F.binary_cross_entropy_with_logits(logits, covered)

@@ -5,13 +5,13 @@ Torchvision's detection parts wherever they fit, under torchvision's names, so t
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
-from torchvision.models.detection.image_list import ImageList
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads
 from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss
 from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
@@ -149,7 +149,7 @@ class MaskRCNN(nn.Module):
         self.num_classes = num_classes
         channels = config.fpn_channels
         self.backbone = Backbone(config)
-        self.rpn = build_rpn(channels, config.anchor_scales, config.proposals)
+        self.rpn = build_rpn(channels, config.anchor_scales, config.finest_stride, config.proposals)
         self.roi_heads = _build_roi_heads(config, num_classes)
         self.cqe = None
         if config.cqe != "off":
@@ -172,16 +172,16 @@ class MaskRCNN(nn.Module):
         [k, 4], the crowd's boxes. n may be 0. `size`: (height, width) of what is no padding, the canvas' when missing.
         """
         features = self.features(images)
-        sizes = [(int(images.shape[-2]), int(images.shape[-1]))] * len(targets)
-        proposals, rpn_losses = self.rpn(ImageList(images, sizes), features, targets)
+        sizes = [(images.shape[-2], images.shape[-1])] * len(targets)
+        proposals, loss_objectness, loss_proposal = self.rpn(sizes[0], list(features.values()), targets)
         heads = self.roi_heads
         sampled, matched, labels, regression = self._sample(proposals, targets)
         box_features = heads.box_head(heads.box_roi_pool(features, sampled, sizes))
         logits, deltas = heads.box_predictor(box_features)
         loss_class, loss_box = fastrcnn_loss(logits.float(), deltas.float(), labels, regression)
         return {
-            "objectness": rpn_losses["loss_objectness"],
-            "rpn_box": rpn_losses["loss_rpn_box_reg"],
+            "objectness": loss_objectness,
+            "rpn_box": loss_proposal,
             "class": loss_class,
             "box": loss_box,
             **self._mask_losses(features, sizes, sampled, matched, labels, targets),
@@ -193,7 +193,7 @@ class MaskRCNN(nn.Module):
         """Proposals that train the heads: their boxes, matched object, label and box deltas, per image."""
         heads = self.roi_heads
         gt_boxes = [t["boxes"].to(proposals[0].dtype) for t in targets]
-        proposals = heads.add_gt_proposals([p.detach() for p in proposals], gt_boxes)
+        proposals = heads.add_gt_proposals(proposals, gt_boxes)
         matched, labels = heads.assign_targets_to_proposals(proposals, gt_boxes, [t["labels"] for t in targets])
         for label, proposal, target in zip(labels, proposals, targets, strict=True):
             label[(label == 0) & in_crowd(proposal, target)] = -1
@@ -223,24 +223,21 @@ class MaskRCNN(nn.Module):
         pooled = heads.mask_roi_pool(features, boxes, sizes)
         logits = heads.mask_predictor(heads.mask_head(pooled)).float()
         # The losses turn masks into float32: only those of the sampled objects, however many the image has.
-        used = [torch.unique(m, return_inverse=True) for m in matches]
-        truths = [TrueMasks.of(t, chosen) for t, (chosen, _) in zip(targets, used, strict=True)]
-        matches = [place for _, place in used]
+        joined: Target = {key: torch.cat([t[key] for t in targets]) for key in ("masks", "frames") if key in targets[0]}
+        before = accumulate((len(t["boxes"]) for t in targets[:-1]), initial=0)
+        every = torch.cat([m + n for m, n in zip(matches, before, strict=True)])
+        used, objects = torch.unique(every, return_inverse=True)
+        truth, where = TrueMasks.of(joined, used), torch.cat(boxes).float()
         classes = torch.cat([label[p] for label, p in zip(labels, positive, strict=True)])
         chosen_logits = logits[torch.arange(len(classes), device=classes.device), classes]
-        per_image = list(zip(truths, [b.float() for b in boxes], matches, strict=True))
-        losses = {"mask": mask_loss(chosen_logits, per_image)}
+        losses = {"mask": mask_loss(chosen_logits, truth, where, objects)}
         if self.cqe is None:
             return losses
         probabilities = chosen_logits.sigmoid()
         quality = self.cqe(pooled, probabilities.to(pooled.dtype))
-        goals = [
-            cqe_targets(p, b, truth, m, self.config.cqe_target, band_of(*target.get("size", sizes[0])))
-            for p, (truth, b, m), target in zip(
-                probabilities.split([len(b) for b in boxes]), per_image, targets, strict=True
-            )
-        ]
-        losses["cqe"] = cqe_loss(quality, classes - 1, torch.cat(goals))
+        bands = [band_of(*t.get("size", sizes[0])) for t, b in zip(targets, boxes, strict=True) for _ in range(len(b))]
+        goals = cqe_targets(probabilities, where, truth, objects, self.config.cqe_target, bands)
+        losses["cqe"] = cqe_loss(quality, classes - 1, goals)
         return losses
 
 

@@ -1,4 +1,4 @@
-"""The region proposal network: torchvision's, exact in mixed precision, and blind to what crowds hide."""
+"""The region proposal network: torchvision's, exact in mixed precision, blind to what crowds hide, batched."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,6 +8,10 @@ from torch import Tensor
 from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.rpn import RegionProposalNetwork, RPNHead
 
+from cohdc_train.models.ops import nms_keep
+
+_NMS_IOU = 0.7
+_MIN_SIDE = 1e-2  # px on the canvas; smaller boxes hold nothing
 _CROWD_OVERLAP = 0.5  # share of a background anchor or proposal inside a crowd box from which it is not a negative
 
 
@@ -23,15 +27,67 @@ class PreciseRPNHead(RPNHead):  # type: ignore[misc]  # torchvision is not typed
         return [one.float() for one in logits], [one.float() for one in deltas]
 
 
-class PreciseAnchors(AnchorGenerator):  # type: ignore[misc]
-    """Torchvision's anchors, float32 whatever the features are, for the same reason."""
-
-    def set_cell_anchors(self, dtype: torch.dtype, device: torch.device) -> None:
-        super().set_cell_anchors(torch.float32, device)
-
-
 class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
-    """Torchvision's RPN, for which a background anchor inside a crowd box is no negative."""
+    """Torchvision's RPN, for which a background anchor inside a crowd box is no negative.
+
+    Anchors lie by the pyramid's strides. Torchvision divides the image by the map instead, which is another number
+    where the image was padded for it.
+    """
+
+    def __init__(self, finest_stride: int, proposals: tuple[int, int], *args: Any) -> None:
+        super().__init__(*args)
+        self.finest_stride = finest_stride
+        self.proposals = proposals
+
+    def forward(
+        self, canvas: tuple[int, int], features: list[Tensor], targets: Sequence[Mapping[str, Any]]
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Proposals of each image [n, 4], canvas px, for training the heads, and the losses of objectness and boxes.
+
+        canvas: (height, width) px of the images; features: of the pyramid, finest first.
+        """
+        objectness, deltas = self.head(features)
+        height, width = canvas
+        limit = objectness[0].new_tensor([[[width, height, width, height]]])
+        with torch.no_grad():
+            proposals = self.propose(objectness, deltas, self.proposals[0], limit)
+            counts = is_solid(proposals).sum(dim=1).tolist()
+        anchors = [torch.cat([self.anchors(level, logits) for level, logits in enumerate(objectness)])] * len(targets)
+        labels, boxes = self.assign_targets_to_anchors(anchors, targets)
+        goals = self.box_coder.encode(boxes, anchors)
+        logits, shifts = (
+            torch.cat([_flatten(one, values) for one in maps], dim=1).flatten(0, 1)
+            for maps, values in ((objectness, 1), (deltas, 4))
+        )
+        losses: tuple[Tensor, Tensor] = self.compute_loss(logits, shifts, labels, goals)
+        return [boxes[:count] for boxes, count in zip(proposals, counts, strict=True)], *losses
+
+    def propose(self, objectness: list[Tensor], deltas: list[Tensor], wanted: int, limit: Tensor) -> Tensor:
+        """[B, R, 4] the best proposals, R at most `wanted`, canvas px; rows without one are zero boxes, and last.
+
+        objectness, deltas: the head's maps; limit: [B, 1, 4], or [1, 1, 4] for all, what boxes are clipped to.
+        """
+        boxes, scores = [], []
+        for level, (logits, delta) in enumerate(zip(objectness, deltas, strict=True)):
+            score, index = _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
+            delta = _flatten(delta, 4).gather(1, index[:, :, None].expand(-1, -1, 4))
+            box = decode(delta.float(), self.anchors(level, logits, index), (1.0, 1.0, 1.0, 1.0), limit)
+            score = torch.where(is_solid(box), score.float().sigmoid(), 0.0)
+            score = torch.where(nms_keep(box, score, _NMS_IOU, 0.0), score, 0.0)
+            boxes.append(box)
+            scores.append(score)
+        score, index = torch.cat(scores, dim=1).topk(min(wanted, sum(s.shape[1] for s in scores)), dim=1)
+        box = torch.cat(boxes, dim=1).gather(1, index[:, :, None].expand(-1, -1, 4))
+        return box * (score > 0)[:, :, None]
+
+    def anchors(self, level: int, logits: Tensor, index: Tensor | None = None) -> Tensor:
+        """[..., 4] a level's anchors at flat positions, or all; shapes count fastest, then columns, rows last."""
+        cell = self.anchor_generator.cell_anchors[level].to(logits.device)
+        index = torch.arange(logits[0].numel(), device=logits.device) if index is None else index
+        stride, shapes, width = self.finest_stride * 2**level, cell.shape[0], logits.shape[3]
+        x, y = (index // shapes) % width * stride, index // (shapes * width) * stride
+        anchors: Tensor = cell[index % shapes] + torch.stack([x, y, x, y], dim=-1)
+        return anchors
 
     def assign_targets_to_anchors(
         self, anchors: list[Tensor], targets: Sequence[Mapping[str, Any]]
@@ -42,12 +98,39 @@ class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
         return labels, matched
 
 
-def build_rpn(channels: int, scales: Sequence[int], proposals: tuple[int, int]) -> CrowdAwareRPN:
+def build_rpn(channels: int, scales: Sequence[int], finest_stride: int, proposals: tuple[int, int]) -> CrowdAwareRPN:
     """channels: of the pyramid; scales: px, one a level, in three aspects; proposals: in training and at inference."""
-    anchors = PreciseAnchors(tuple((scale,) for scale in scales), ((0.5, 1.0, 2.0),) * len(scales))
+    anchors = AnchorGenerator(tuple((scale,) for scale in scales), ((0.5, 1.0, 2.0),) * len(scales))
     head = PreciseRPNHead(channels, anchors.num_anchors_per_location()[0])
     top = {"training": proposals[0], "testing": proposals[1]}
-    return CrowdAwareRPN(anchors, head, 0.7, 0.3, 256, 0.5, {k: 2 * n for k, n in top.items()}, top, 0.7)
+    twice = {kind: 2 * n for kind, n in top.items()}
+    return CrowdAwareRPN(finest_stride, proposals, anchors, head, 0.7, 0.3, 256, 0.5, twice, top, _NMS_IOU)
+
+
+def decode(deltas: Tensor, boxes: Tensor, weights: tuple[float, ...], limit: Tensor) -> Tensor:
+    """Box deltas [B, n, 4] applied to boxes [B, n, 4] and clipped to limit [B, 1, 4] (R-CNN's parametrisation)."""
+    size = boxes[:, :, 2:] - boxes[:, :, :2]
+    centre = boxes[:, :, :2] + 0.5 * size
+    shift = deltas * deltas.new_tensor([1.0 / weight for weight in weights])
+    centre = centre + shift[:, :, :2] * size
+    half = 0.5 * torch.exp(shift[:, :, 2:].clamp(max=4.135)) * size  # at most 1000 / 16 times as large
+    corners = torch.cat([centre - half, centre + half], dim=2)
+    return torch.minimum(corners.clamp(min=0.0), limit)
+
+
+def is_solid(boxes: Tensor) -> Tensor:
+    """[B, n] bool: both sides of the box are long enough to hold something."""
+    return ((boxes[:, :, 2:] - boxes[:, :, :2]) >= _MIN_SIDE).all(dim=2)
+
+
+def _flatten(maps: Tensor, values: int) -> Tensor:
+    """[B, A * values, H, W] -> [B, H * W * A, values]: the order of torchvision's anchors."""
+    batch, channels, height, width = maps.shape
+    return (
+        maps.reshape(batch, channels // values, values, height, width)
+        .permute(0, 3, 4, 1, 2)
+        .reshape(batch, height * width * (channels // values), values)
+    )
 
 
 def in_crowd(boxes: Tensor, target: Mapping[str, Any]) -> Tensor:

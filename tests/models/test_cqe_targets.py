@@ -151,8 +151,8 @@ def test_targets_on_the_canvas_are_those_of_the_pasted_mask(rectangles, corner, 
     boundary = boundary_iou(pasted, whole, 2).item()
     true, matched = _true(truth[None].to(torch.uint8)), torch.tensor([0])
     # a pixel whose value lies on .5 to the last bit may fall to either side
-    assert cqe_targets(mask, box[None], true, matched, "boundary_iou", 2).item() == pytest.approx(boundary, abs=0.02)
-    assert cqe_targets(mask, box[None], true, matched, "min", 2).item() == pytest.approx(min(iou, boundary), abs=0.02)
+    assert cqe_targets(mask, box[None], true, matched, "boundary_iou", [2]).item() == pytest.approx(boundary, abs=0.02)
+    assert cqe_targets(mask, box[None], true, matched, "min", [2]).item() == pytest.approx(min(iou, boundary), abs=0.02)
 
 
 def _mini(mask, side=56):
@@ -173,7 +173,7 @@ def test_a_mini_mask_stands_for_the_whole_one():
     assert (exact - projected).abs().mean() < 0.01
     mask = (exact > 0.3).float()
     for kind in ("iou", "ciou", "boundary_iou", "min"):
-        one, other = (cqe_targets(mask, box, t, matched, kind, 5).item() for t in (whole, mini))
+        one, other = (cqe_targets(mask, box, t, matched, kind, [5]).item() for t in (whole, mini))
         assert other == pytest.approx(one, abs=0.02)
 
 

@@ -1,5 +1,6 @@
 """The network against torchvision's own Mask R-CNN, its losses at the edges, and that it can learn two pictures."""
 
+import copy
 import dataclasses
 
 import pytest
@@ -7,10 +8,10 @@ import torch
 from torch import nn
 from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
 from torchvision.models.detection.image_list import ImageList
+from torchvision.models.detection.rpn import RegionProposalNetwork
 from torchvision.ops import box_iou
 
 from cohdc_train.models import Detector, MaskRCNN, NetworkConfig, detect
-from cohdc_train.models.inference import _anchors
 
 
 def _target(boxes, size=(96, 128), ignore=()):
@@ -89,9 +90,27 @@ def test_anchors_equal_torchvisions(opinionated):
     strides = [[torch.tensor(s), torch.tensor(s)] for s in (4, 8, 16, 32)]
     expected = generator.grid_anchors(grids, strides)
     for level, (height, width) in enumerate(grids):
-        index = torch.arange(height * width * 3)[None]
-        anchors = _anchors(generator.cell_anchors[level], index, width, 4 * 2**level)[0]
+        anchors = opinionated.rpn.anchors(level, torch.zeros(2, 3, height, width))
         torch.testing.assert_close(anchors, expected[level])
+
+
+@pytest.mark.parametrize("canvas", [(96, 128), (80, 120)])  # the second is padded for the network, not for its anchors
+def test_proposals_and_their_losses_are_torchvisions(opinionated, canvas):
+    torch.manual_seed(3)
+    images, rpn = torch.rand(2, 3, *canvas), copy.deepcopy(opinionated.rpn).train()
+    targets = [_target([[10, 10, 60, 70], [64, 20, 118, 80]], canvas), _target([], canvas)]
+    with torch.no_grad():
+        features = opinionated.features(images)
+    theirs = RegionProposalNetwork.forward
+    generator = torch.random.get_rng_state()
+    proposals, objectness, boxes = rpn(canvas, list(features.values()), targets)
+    torch.random.set_rng_state(generator)
+    expected, losses = theirs(rpn, ImageList(torch.zeros(2, 3, 96, 128), [canvas] * 2), features, targets)
+    torch.testing.assert_close(objectness, losses["loss_objectness"])
+    torch.testing.assert_close(boxes, losses["loss_rpn_box_reg"])
+    for found, wanted in zip(proposals, expected, strict=True):
+        assert len(found) >= 10
+        torch.testing.assert_close(found, wanted, atol=1e-3, rtol=0)
 
 
 def test_padding_is_zero_and_scores_fall(opinionated):
@@ -193,14 +212,11 @@ def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
     with torch.autocast("cpu", torch.bfloat16):
         losses = network.losses(torch.rand(1, 3, 96, 1024), targets)
         features = network.features(torch.rand(1, 3, 96, 1024))
-        proposals, _ = network.rpn(ImageList(torch.rand(1, 3, 96, 1024), [(96, 1024)]), features, targets)
+        proposals, *_ = network.rpn((96, 1024), list(features.values()), targets)
         sampled, _, _, _ = network._sample(proposals, targets)
-        anchors = network.rpn.anchor_generator(
-            ImageList(torch.rand(1, 3, 96, 1024), [(96, 1024)]), list(features.values())
-        )
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert features["0"].dtype == torch.bfloat16
-    assert sampled[0].dtype == anchors[0].dtype == torch.float32
+    assert sampled[0].dtype == network.rpn.anchors(0, features["0"]).dtype == torch.float32
     assert (sampled[0] == targets[0]["boxes"][0]).all(dim=1).any()
 
 

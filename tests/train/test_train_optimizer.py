@@ -6,11 +6,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Timer
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.models import NetworkConfig
+from cohdc_train.models import MaskRCNN, NetworkConfig
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.optimizer import OptimizerConfig
+from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, time_spent
 
 TINY = NetworkConfig(depth=18, width=0.125, fpn_channels=8, fc=16, canvas=(32, 32))
 
@@ -19,6 +21,7 @@ class Steps:
     """As much of a trainer as the optimizer asks for."""
 
     precision = "32-true"
+    callbacks: tuple[Any, ...] = ()
 
     def __init__(self, total: float) -> None:
         self.estimated_stepping_batches = total
@@ -71,6 +74,31 @@ def test_frozen_stages_are_not_optimized() -> None:
 def test_a_schedule_without_an_end_is_refused() -> None:
     with pytest.raises(CohdcError, match="max_epochs"):
         module(total=float("inf")).configure_optimizers()
+
+
+def test_the_rate_falls_with_the_time_where_that_ends_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = {"now": 0.0}
+    monkeypatch.setattr(Timer, "time_elapsed", lambda self, stage="train": clock["now"])
+    options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    trainer = Trainer(max_epochs=-1, max_time={"seconds": 100}, **options)
+    spent = time_spent(trainer)
+    assert spent is not None
+    config = OptimizerConfig(warmup_steps=10, lr=1.0, final_fraction=0.0, backbone_lr=0.5, frozen_steps=3)
+    optimizer, schedule = build_optimizer(config, MaskRCNN(1, TINY), 2**31, False, spent)
+    rates = []
+    for seconds in (5.0, *range(10, 101, 10)):  # of ten steps of warm-up, the clock's beginning is not seen
+        for _ in range(11):
+            clock["now"] = float(seconds)
+            optimizer.step()
+            schedule.step()
+        rates.append(schedule.get_last_lr())
+    assert [head for head, *_ in rates] == pytest.approx(
+        [config.factor(11, 2**31, s / 100) for s in (5, *range(10, 101, 10))]
+    )
+    assert rates[5][0] == pytest.approx(0.5)
+    assert rates[-1][0] == pytest.approx(0.0, abs=1e-12)
+    assert all(body == pytest.approx(0.5 * head) for head, _, body, *_ in rates)
+    assert time_spent(Trainer(max_epochs=3, **options)) is None
 
 
 @pytest.mark.parametrize("options", [{"lr": 0.0}, {"final_fraction": 1.5}, {"backbone_lr": -1.0}])
