@@ -65,9 +65,15 @@ class FitCommand(LightningCLI):
     """Lightning's command line with this project's defaults; `run` trains."""
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """`--out`, `--ckpt_path`, the checkpoints, and what the network takes over from the data."""
+        """`--out`, `--ckpt_path`, `--pretrained`, the checkpoints, and what the network takes over from the data."""
         parser.add_argument("--out", type=Path, default=Path("runs/fit"), help="folder for everything that is written")
         parser.add_argument("--ckpt_path", type=Path | None, default=None, help="checkpoint of a training to resume")
+        parser.add_argument(
+            "--pretrained",
+            type=Path | None,
+            default=None,
+            help="checkpoint to start from, of other data or classes too",
+        )
         parser.add_argument(
             "--ema", type=float, default=0.0, help="decay of the weights' moving average, such as .999; 0: none"
         )
@@ -110,10 +116,13 @@ class FitCommand(LightningCLI):
         return super().instantiate_trainer(**kwargs)
 
     def run(self) -> None:
-        """Train, from the beginning or from `--ckpt_path`."""
+        """Train, from the beginning, from the weights of `--pretrained`, or where `--ckpt_path` ended."""
         checkpoint: Path | None = self.config["ckpt_path"]
         if checkpoint is not None and not checkpoint.is_file():
             raise CohdcError(f"{checkpoint}: no such file")
+        if self.config["pretrained"] is not None and checkpoint is None:
+            left = self.model.take_over(self.config["pretrained"])
+            rank_zero_info(f"{self.config['pretrained']}: all weights but {', '.join(left) or 'none'}")
         if self.datamodule.batch_size == "auto":
             self._choose_batch_size()
         body = self.model.network.backbone.body

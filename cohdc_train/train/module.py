@@ -16,6 +16,7 @@ from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
 from cohdc_train.train.metrics import Results, SegmentationMetrics
 from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, time_spent
 
+_OF_CLASSES = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.", "cqe.quality.")
 _ENDLESS = 2**31  # steps of a training that only time ends
 MIN_CANVAS = 32  # px: one cell of the coarsest level that RoIs are pooled from
 _NETWORK = NetworkConfig()
@@ -81,6 +82,25 @@ class MaskRCNNModule(pl.LightningModule):
             reason = str(error).partition("\n")[0]
             raise CohdcError(f"{path}: not a checkpoint of cohdc fit: {type(error).__name__}: {reason}") from error
         return module.eval()
+
+    def take_over(self, path: Path) -> list[str]:
+        """Start from the weights of another training: all of those that have the same name and shape here.
+
+        What decides between classes is taken over only with the same classes. Returns the names that were not. Raises
+        CohdcError naming the file when it is no checkpoint of this class, or none of its weights fits.
+        """
+        other = MaskRCNNModule.load(path)
+        theirs, own = other.network.state_dict(), self.network.state_dict()
+        specific = () if other.class_names == self.class_names else _OF_CLASSES
+        fitting = {
+            name: weights
+            for name, weights in theirs.items()
+            if name in own and own[name].shape == weights.shape and not name.startswith(specific)
+        }
+        if not fitting:
+            raise CohdcError(f"{path}: none of its {len(theirs)} weights fits this network")
+        self.network.load_state_dict(fitting, strict=False)
+        return [name for name in own if name not in fitting]
 
     def setup(self, stage: str) -> None:
         """Lay the weights out channels last for half precision, whose convolutions are faster so."""

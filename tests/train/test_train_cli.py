@@ -14,6 +14,7 @@ import coco_toys
 
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError
+from cohdc_train.models import NetworkConfig
 from cohdc_train.train.cli import fit
 from cohdc_train.train.module import MaskRCNNModule
 
@@ -111,6 +112,33 @@ def test_training_resumes_with_more_epochs(toy: Path, run: Path) -> None:
     assert (trainer.current_epoch, trainer.global_step) == (2, 6)
 
 
+def test_a_training_starts_from_the_weights_of_another(toy: Path, run: Path) -> None:
+    still = ("--model.optimizer.lr=1e-12", f"--pretrained={run / 'last.ckpt'}")
+    fit(arguments(toy, toy / "same", *still))
+    before, after = (MaskRCNNModule.load(out / "last.ckpt").network for out in (run, toy / "same"))
+    for (name, old), new in zip(before.named_parameters(), after.parameters(), strict=True):
+        torch.testing.assert_close(new, old, atol=1e-6, rtol=0, msg=name)
+
+
+def test_other_classes_take_over_all_but_what_decides_between_classes(run: Path) -> None:
+    before = MaskRCNNModule.load(run / "last.ckpt")
+    for names in (["person"], ["dog", "cat"]):  # the second has as many classes
+        module = MaskRCNNModule(names, before.network_config)
+        own = {name: weights.clone() for name, weights in module.network.state_dict().items()}
+        left = module.take_over(run / "last.ckpt")
+        assert {name.rsplit(".", 2)[-2] for name in left} == {"cls_score", "bbox_pred", "mask_fcn_logits", "quality"}
+        old, new = before.network.state_dict(), module.network.state_dict()
+        assert all(torch.equal(new[name], own[name] if name in left else old[name]) for name in new)
+
+
+def test_a_checkpoint_without_a_fitting_weight_is_refused(run: Path) -> None:
+    other = NetworkConfig(depth=50, width=0.25, fpn_channels=16, fc=32, anchor_scales=(8, 16, 32, 64))
+    module = MaskRCNNModule(["dog"], other)
+    module.network = torch.nn.ModuleDict({"another": torch.nn.Linear(1, 1)})  # type: ignore[assignment]
+    with pytest.raises(CohdcError, match=r"last\.ckpt: none of its \d+ weights fits"):
+        module.take_over(run / "last.ckpt")
+
+
 def test_a_changed_class_map_is_refused(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["fit", *arguments(toy, toy / "no", "--data.classes=[car]", f"--ckpt_path={run / 'last.ckpt'}")])
     assert code == 1
@@ -153,6 +181,7 @@ def test_an_unreadable_image_is_told_in_one_line_from_a_worker(tmp_path: Path) -
         (["--model.network.anchor_scales=[8]"], "anchor_scales"),
         (["--data.classes=[dog]"], "'dog'"),
         (["--ckpt_path=nowhere.ckpt"], "nowhere.ckpt"),
+        (["--pretrained=nowhere.ckpt"], "nowhere.ckpt"),
         (["--config=table3/test99.yaml"], "test99.yaml"),
     ],
 )
