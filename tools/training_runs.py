@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cohdc_train.bench.training import call, train
+from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,7 +52,10 @@ class Run:
 
 
 def run_all(runs: Sequence[Run], jobs: int) -> list[dict[str, Scores]]:
-    """The scores of every run, `jobs` at a time, in their order; says how far it is."""
+    """The scores of every run, `jobs` at a time, in their order; says how far it is.
+
+    Raises SystemExit with the one line of a training that failed.
+    """
 
     def one(run: Run) -> dict[str, Scores]:
         scores = run.scores()
@@ -61,7 +65,11 @@ def run_all(runs: Sequence[Run], jobs: int) -> list[dict[str, Scores]]:
         return scores
 
     with ThreadPoolExecutor(jobs) as pool:
-        return list(pool.map(one, runs))
+        try:
+            return list(pool.map(one, runs))
+        except CohdcError as error:
+            pool.shutdown(cancel_futures=True)
+            raise SystemExit(str(error)) from None
 
 
 def spread(values: Sequence[float]) -> str:

@@ -61,7 +61,7 @@ class Tracker:
     def __init__(
         self,
         camera: Camera,
-        features: int = 1000,
+        features: int,
         seed: int = 0,
         method: Method | None = None,
         executor: Executor | None = None,

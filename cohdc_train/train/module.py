@@ -102,11 +102,6 @@ class MaskRCNNModule(pl.LightningModule):
         self.network.load_state_dict(fitting, strict=False)
         return [name for name in own if name not in fitting]
 
-    def setup(self, stage: str) -> None:
-        """Lay the weights out channels last for half precision, whose convolutions are faster so."""
-        if stage == "fit" and self.trainer.precision in ("bf16-mixed", "16-mixed"):
-            self.network.to(memory_format=torch.channels_last)
-
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """The sum of the losses. Raises CohdcError naming step and images when it is not finite."""
         losses = self.network.losses(batch.images, batch.targets)

@@ -79,7 +79,7 @@ def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.Monke
 
 
 def test_nothing_to_see_is_lost_not_guessed() -> None:
-    tracker = Tracker(CAMERA)
+    tracker = Tracker(CAMERA, features=1000)
     pose = tracker.track(BLACK, NOTHING, 0.0)
     assert not pose.tracked
     assert pose.T_wc is None

@@ -1,0 +1,104 @@
+"""The weights of an exported file, back in a network: what a training can start from when no checkpoint is left."""
+
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import onnx
+import torch
+from onnx import ModelProto, NodeProto, numpy_helper
+from torch import Tensor, nn
+
+from cohdc_train.models.fused import fused
+from cohdc_train.models.inference import detect
+from cohdc_train.models.mask_rcnn import MaskRCNN
+from cohdc_train.models.staged import FrozenNorm
+
+_LAYERS = nn.Conv2d | nn.ConvTranspose2d | nn.Linear
+_NAMED, _NUMBER = re.compile(r"network\.(.+)\.weight"), re.compile(r"\d+")
+_OPERATORS = ("Conv", "ConvTranspose", "Gemm")
+
+
+def load_exported(network: MaskRCNN, path: Path) -> None:
+    """Put the weights of an ONNX file that `cohdc export` wrote, quantised or not, into a network of the same shape.
+
+    A layer into which its norm was folded has lost its name; such layers are paired in the order in which they run. Norms
+    must be frozen here; they become the identity and a shift.
+    Raises ValueError when the layers do not agree, or a norm is one that is trained.
+    """
+    stored = _stored(onnx.load(path))
+    layers = list(dict.fromkeys(_running(network)))
+    numbered = iter(sorted(key for key in stored if isinstance(key, int)))
+    if len(layers) != len(stored):
+        raise ValueError(f"the file has {len(stored)} layers, the network {len(layers)}")
+    norms = _norms(network)
+    own = dict(network.named_modules())
+    for name in layers:
+        weights, bias = stored[name if name in stored else next(numbered)]
+        layer, norm = own[name], norms.get(name)
+        if layer.weight.shape != weights.shape:
+            raise ValueError(f"layer {name} is {list(weights.shape)} in the file, {list(layer.weight.shape)} here")
+        with torch.no_grad():
+            layer.weight.copy_(weights)
+            if norm is None:
+                layer.bias.copy_(bias)
+                continue
+            if not isinstance(norm, FrozenNorm):
+                raise ValueError(f"the norm behind {name} is trained, and the file holds none; freeze it")
+            norm.weight.fill_(1)
+            norm.running_mean.zero_()
+            norm.running_var.fill_(1 - norm.eps)
+            norm.bias.copy_(bias)
+
+
+def _running(network: MaskRCNN) -> Iterator[str]:
+    """Names of the layers in the order in which they first run; the CQE and mask heads run without detections too."""
+    copy, names = fused(network), []
+    for name, module in copy.named_modules():
+        if isinstance(module, _LAYERS):
+            module.register_forward_pre_hook(lambda _, __, name=name: names.append(name))
+    detect(copy, [torch.zeros(3, *network.config.canvas, dtype=torch.uint8)])
+    yield from names
+
+
+def _norms(network: MaskRCNN) -> dict[str, nn.Module]:
+    """Name of a convolution -> the norm that `fused` would fold into it."""
+    found = {}
+    for prefix, module in network.named_modules():
+        for (name, first), (_, second) in pairwise(list(module.named_children())):
+            if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
+                found[f"{prefix}.{name}" if prefix else name] = second
+    return found
+
+
+def _stored(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:
+    """Weights and bias of every layer, by its name, or by the number that the exporter gave it in its order."""
+    tensors = {one.name: one for one in model.graph.initializer}
+    makers = {name: node for node in model.graph.node for name in node.output}
+    found: dict[str | int, tuple[Tensor, Tensor]] = {}
+    for node in model.graph.node:
+        if node.op_type in _OPERATORS:
+            weights, bias = (_value(name, tensors, makers) for name in node.input[1:3])
+            named = _NAMED.match(node.input[1])
+            numbers = _NUMBER.search(node.input[1])
+            if named is None and numbers is None:
+                raise ValueError(f"layer {node.name}: {node.input[1]} is no name that cohdc export gives")
+            found[named[1] if named else int(numbers[0]) if numbers else ""] = weights, bias
+    return found
+
+
+def _value(name: str, tensors: dict[str, onnx.TensorProto], makers: dict[str, NodeProto]) -> Tensor:
+    """An initialiser, or what DequantizeLinear makes of one."""
+    if name in tensors:
+        return torch.from_numpy(numpy_helper.to_array(tensors[name]).copy())
+    node = makers[name]
+    if node.op_type != "DequantizeLinear":
+        raise ValueError(f"{name} is made by {node.op_type}")
+    quantised, scale, *zero = (_value(one, tensors, makers) for one in node.input)
+    axis = next((a.i for a in node.attribute if a.name == "axis"), 1)
+    shape = [1] * quantised.ndim
+    if scale.numel() > 1:
+        shape[axis] = -1
+    shift = zero[0].float().reshape(shape) if zero else 0.0
+    return (quantised.float() - shift) * scale.reshape(shape)
