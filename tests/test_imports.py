@@ -24,7 +24,7 @@ ALLOWED: dict[str, set[str]] = {
     "data": {"presets", "errors"},
     "synth": {"errors"},
     "models": set(),
-    "train": {"data", "models", "contour", "masks", "presets", "errors"},
+    "train": {"data", "models", "signature", "contour", "masks", "presets", "errors"},
     "validate": {"train", "data", "segmenter", "presets", "errors"},
     "export": {"validate", "train", "data", "models", "segmenter", "signature", "masks", "errors"},
     "bench": {"validate", "train", "data", "models", "export", "segmenter", "contour", "masks", "presets", "errors"},

@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_info
 
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
-from cohdc_train.presets import config_path
+from cohdc_train.presets import config_path, model_path
 from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.ema import ema
@@ -72,7 +72,7 @@ class FitCommand(LightningCLI):
             "--pretrained",
             type=Path | None,
             default=None,
-            help="checkpoint to start from, of other data or classes too",
+            help="checkpoint, exported file or shipped network (person) to start from, of other classes too",
         )
         parser.add_argument(
             "--ema", type=float, default=0.0, help="decay of the weights' moving average, such as .999; 0: none"
@@ -91,6 +91,11 @@ class FitCommand(LightningCLI):
         parser.link_arguments("out", "trainer.default_root_dir")
         parser.link_arguments("data.canvas", "model.network.canvas")
         parser.link_arguments("data.class_names", "model.class_names", apply_on="instantiate")
+
+    def before_instantiate_classes(self) -> None:
+        """No ImageNet weights are fetched where all weights come from another training."""
+        if self.config["pretrained"] is not None:
+            self.config["model"]["network"]["weights"] = None
 
     def instantiate_classes(self) -> None:
         """Data, network and trainer; a value that one of them refuses is the user's error."""
@@ -121,7 +126,7 @@ class FitCommand(LightningCLI):
         if checkpoint is not None and not checkpoint.is_file():
             raise CohdcError(f"{checkpoint}: no such file")
         if self.config["pretrained"] is not None and checkpoint is None:
-            left = self.model.take_over(self.config["pretrained"])
+            left = self.model.take_over(model_path(self.config["pretrained"]))
             rank_zero_info(f"{self.config['pretrained']}: all weights but {', '.join(left) or 'none'}")
         if self.datamodule.batch_size == "auto":
             self._choose_batch_size()

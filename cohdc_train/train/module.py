@@ -13,6 +13,7 @@ from torch import Tensor
 from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
+from cohdc_train.train.exported import load_exported, read_exported
 from cohdc_train.train.metrics import Results, SegmentationMetrics
 from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, time_spent
 
@@ -86,10 +87,11 @@ class MaskRCNNModule(pl.LightningModule):
     def take_over(self, path: Path) -> list[str]:
         """Start from the weights of another training: all of those that have the same name and shape here.
 
-        What decides between classes is taken over only with the same classes. Returns the names that were not. Raises
-        CohdcError naming the file when it is no checkpoint of this class, or none of its weights fits.
+        path: a checkpoint, or what was exported of one, a shipped network's name too; then the network must be the same
+        but for the classes. What decides between classes is taken over only with the same classes. Returns the names
+        of what was not. Raises CohdcError naming the file when it is neither, or none of its weights fits.
         """
-        other = MaskRCNNModule.load(path)
+        other = self._of_file(path) if path.suffix == ".onnx" else MaskRCNNModule.load(path)
         theirs, own = other.network.state_dict(), self.network.state_dict()
         specific = () if other.class_names == self.class_names else _OF_CLASSES
         fitting = {
@@ -101,6 +103,17 @@ class MaskRCNNModule(pl.LightningModule):
             raise CohdcError(f"{path}: none of its {len(theirs)} weights fits this network")
         self.network.load_state_dict(fitting, strict=False)
         return [name for name in own if name not in fitting]
+
+    def _of_file(self, path: Path) -> "MaskRCNNModule":
+        try:
+            model, class_names = read_exported(path)
+            other = MaskRCNNModule(class_names, dataclasses.replace(self.network_config, weights=None))
+            load_exported(other.network, model)
+        except FileNotFoundError as error:
+            raise CohdcError(f"{path}: no such file") from error
+        except ValueError as error:
+            raise CohdcError(f"{path}: {error}") from error
+        return other
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """The sum of the losses. Raises CohdcError naming step and images when it is not finite."""

@@ -1,5 +1,6 @@
 """The weights of an exported file, back in a network: what a training can start from when no checkpoint is left."""
 
+import json
 import re
 from collections.abc import Iterator
 from itertools import pairwise
@@ -7,27 +8,39 @@ from pathlib import Path
 
 import onnx
 import torch
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from onnx import ModelProto, NodeProto, numpy_helper
 from torch import Tensor, nn
 
-from cohdc_train.models.fused import fused
-from cohdc_train.models.inference import detect
-from cohdc_train.models.mask_rcnn import MaskRCNN
+from cohdc_train.models import MaskRCNN, detect, fused
 from cohdc_train.models.staged import FrozenNorm
+from cohdc_train.signature import KEY_CLASSES
 
 _LAYERS = nn.Conv2d | nn.ConvTranspose2d | nn.Linear
 _NAMED, _NUMBER = re.compile(r"network\.(.+)\.weight"), re.compile(r"\d+")
 _OPERATORS = ("Conv", "ConvTranspose", "Gemm")
 
 
-def load_exported(network: MaskRCNN, path: Path) -> None:
-    """Put the weights of an ONNX file that `cohdc export` wrote, quantised or not, into a network of the same shape.
+def read_exported(path: Path) -> tuple[ModelProto, list[str]]:
+    """An ONNX file that `cohdc export` wrote, and its classes. Raises ValueError when it is none, OSError unread."""
+    try:
+        model = onnx.load(path)
+    except DecodeError as error:
+        raise ValueError("not an ONNX file") from error
+    classes = {entry.key: entry.value for entry in model.metadata_props}.get(KEY_CLASSES)
+    if classes is None:
+        raise ValueError(f"not written by cohdc export: no {KEY_CLASSES} in its metadata")
+    return model, list(json.loads(classes))
 
-    A layer into which its norm was folded has lost its name; such layers are paired in the order in which they run. Norms
-    must be frozen here; they become the identity and a shift.
+
+def load_exported(network: MaskRCNN, model: ModelProto) -> None:
+    """Put the weights of an exported file, quantised or not, into a network of the same shape.
+
+    A layer into which its norm was folded has lost its name; such layers are paired in the order in which they run.
+    Norms must be frozen here; they become the identity and a shift.
     Raises ValueError when the layers do not agree, or a norm is one that is trained.
     """
-    stored = _stored(onnx.load(path))
+    stored = _stored(model)
     layers = list(dict.fromkeys(_running(network)))
     numbered = iter(sorted(key for key in stored if isinstance(key, int)))
     if len(layers) != len(stored):
@@ -53,7 +66,7 @@ def load_exported(network: MaskRCNN, path: Path) -> None:
 
 
 def _running(network: MaskRCNN) -> Iterator[str]:
-    """Names of the layers in the order in which they first run; the CQE and mask heads run without detections too."""
+    """Names of the layers in the order in which they run, the mask and CQE heads' without a detection too."""
     copy, names = fused(network), []
     for name, module in copy.named_modules():
         if isinstance(module, _LAYERS):
@@ -79,13 +92,18 @@ def _stored(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:
     found: dict[str | int, tuple[Tensor, Tensor]] = {}
     for node in model.graph.node:
         if node.op_type in _OPERATORS:
-            weights, bias = (_value(name, tensors, makers) for name in node.input[1:3])
-            named = _NAMED.match(node.input[1])
-            numbers = _NUMBER.search(node.input[1])
-            if named is None and numbers is None:
-                raise ValueError(f"layer {node.name}: {node.input[1]} is no name that cohdc export gives")
-            found[named[1] if named else int(numbers[0]) if numbers else ""] = weights, bias
+            weights, *biases = (_value(name, tensors, makers) for name in node.input[1:3])
+            bias = biases[0] if biases else torch.zeros(())  # one that was all zeros is left out
+            found[_key(node.input[1])] = weights, bias
     return found
+
+
+def _key(weights: str) -> str | int:
+    if named := _NAMED.match(weights):
+        return named[1]
+    if number := _NUMBER.search(weights):
+        return int(number[0])
+    raise ValueError(f"its weights {weights} have no name that cohdc export gives")
 
 
 def _value(name: str, tensors: dict[str, onnx.TensorProto], makers: dict[str, NodeProto]) -> Tensor:
