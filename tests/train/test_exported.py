@@ -16,16 +16,6 @@ from cohdc_train.models.staged import FrozenNorm
 from cohdc_train.train.module import MaskRCNNModule
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
-SMALL = NetworkConfig(
-    depth=18,
-    width=0.25,
-    canvas=(96, 128),
-    fpn_channels=16,
-    fc=32,
-    proposals=(100, 50),
-    detections=10,
-    anchor_scales=(16, 32, 64, 128),
-)
 IMAGE = torch.from_numpy(drawn_images(1)[0]).permute(2, 0, 1)
 
 
@@ -51,10 +41,10 @@ def module_of(config: NetworkConfig, names: list[str]) -> MaskRCNNModule:
 
 
 @pytest.fixture(scope="module", params=["resnet", "mobilenet_v2"])
-def network(request: pytest.FixtureRequest) -> MaskRCNN:
+def network(request: pytest.FixtureRequest, opinionated: MaskRCNN) -> MaskRCNN:
     options: dict[str, Any] = {"norm": "frozen", "backbone": request.param, "score_threshold": 0.05}
     options |= {} if request.param == "resnet" else {"width": 1.0, "rates": ((1,), (1,), (1, 2), (1, 2, 3))}
-    return trained(dataclasses.replace(SMALL, **options))
+    return trained(dataclasses.replace(opinionated.config, **options))
 
 
 @pytest.fixture(scope="module")
