@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -41,14 +40,17 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
     Raises ValueError when the layers do not agree, or a norm is one that is trained.
     """
     stored = _stored(model)
-    layers = list(dict.fromkeys(_running(network)))
+    layers = _running(network)
     numbered = iter(sorted(key for key in stored if isinstance(key, int)))
     if len(layers) != len(stored):
         raise ValueError(f"the file has {len(stored)} layers, the network {len(layers)}")
     norms = _norms(network)
     own = dict(network.named_modules())
     for name in layers:
-        weights, bias = stored[name if name in stored else next(numbered)]
+        key = name if name in stored else next(numbered, None)
+        if key is None:
+            raise ValueError(f"the file has no layer {name}")
+        weights, bias = stored[key]
         layer, norm = own[name], norms.get(name)
         if layer.weight.shape != weights.shape:
             raise ValueError(f"layer {name} is {list(weights.shape)} in the file, {list(layer.weight.shape)} here")
@@ -65,14 +67,15 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
             norm.bias.copy_(bias)
 
 
-def _running(network: MaskRCNN) -> Iterator[str]:
-    """Names of the layers in the order in which they run, the mask and CQE heads' without a detection too."""
-    copy, names = fused(network), []
+def _running(network: MaskRCNN) -> list[str]:
+    """Names of the layers in the order in which they first run, the mask and CQE heads' without a detection too."""
+    names: list[str] = []
+    copy = fused(network)
     for name, module in copy.named_modules():
         if isinstance(module, _LAYERS):
             module.register_forward_pre_hook(lambda _, __, name=name: names.append(name))
     detect(copy, [torch.zeros(3, *network.config.canvas, dtype=torch.uint8)])
-    yield from names
+    return list(dict.fromkeys(names))
 
 
 def _norms(network: MaskRCNN) -> dict[str, nn.Module]:

@@ -87,9 +87,9 @@ class MaskRCNNModule(pl.LightningModule):
     def take_over(self, path: Path) -> list[str]:
         """Start from the weights of another training: all of those that have the same name and shape here.
 
-        path: a checkpoint, or what was exported of one, a shipped network's name too; then the network must be the same
-        but for the classes. What decides between classes is taken over only with the same classes. Returns the names
-        of what was not. Raises CohdcError naming the file when it is neither, or none of its weights fits.
+        path: a checkpoint, or an ONNX file that was exported of one; then the network must be the same but for the
+        classes. What decides between classes is taken over only with the same classes. Returns the names of what was
+        not. Raises CohdcError naming the file when it is neither, or none of its weights fits.
         """
         other = self._of_file(path) if path.suffix == ".onnx" else MaskRCNNModule.load(path)
         theirs, own = other.network.state_dict(), self.network.state_dict()
