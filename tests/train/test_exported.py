@@ -63,6 +63,7 @@ def test_the_network_finds_what_the_file_finds(network: MaskRCNN, file: Path) ->
         torch.testing.assert_close(found[name], values, atol=2e-3, rtol=1e-3, msg=name)
 
 
+@pytest.mark.slow
 def test_quantised_weights_come_back_within_their_step(network: MaskRCNN, file: Path, tmp_path: Path) -> None:
     small = tmp_path / "model.int8.onnx"
     quantize(file, small, drawn_images(2))
