@@ -34,6 +34,14 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=2) + "\n")
 
 
+def link_or_copy(path: Path, target: Path) -> None:
+    """Make `target` the same file, or a copy of it on another disk or a file system without links."""
+    try:
+        os.link(path.resolve(), target)
+    except OSError:
+        shutil.copyfile(path, target)
+
+
 def sha256(path: Path) -> str:
     """Hexadecimal digest of a file's content. Raises DataError when there is no such file."""
     if not path.is_file():

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from cohdc_train.data.formats_voc import read_voc
 from cohdc_train.data.formats_yolo import read_yolo
 from cohdc_train.data.layout import find_split
 from cohdc_train.errors import DataError
-from cohdc_train.files import new_folder, write_text
+from cohdc_train.files import link_or_copy, new_folder, write_text
 
 Format = Literal["labelme", "via", "yolo", "voc"]
 _JPEG_QUALITY = 95  # of images that have to be turned
@@ -131,10 +130,7 @@ def _write_image(image: SourceImage, target: Path) -> None:
     elif image.pixels:
         target.write_bytes(image.pixels())
     else:
-        try:
-            os.link(image.path.resolve(), target)
-        except OSError:  # another disk, or a file system without links
-            shutil.copyfile(image.path, target)
+        link_or_copy(image.path, target)
 
 
 def _content(

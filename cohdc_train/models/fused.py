@@ -1,6 +1,7 @@
 """A network made faster for inference: norms folded into the convolutions before them, weights channels last."""
 
 import copy
+from collections.abc import Iterator
 from itertools import pairwise
 
 import torch
@@ -18,16 +19,19 @@ def fused(network: MaskRCNN, dtype: torch.dtype | None = None) -> MaskRCNN:
     under autocast to it, which would else cast them anew for every batch.
     """
     copied = copy.deepcopy(network).eval().requires_grad_(False)
-    for module in list(copied.modules()):
-        _fold(module)
+    for module, name, norm_name in list(foldable(copied)):
+        convolution, norm = getattr(module, name), getattr(module, norm_name)
+        setattr(module, name, fuse_conv_bn_eval(convolution, norm))
+        setattr(module, norm_name, nn.Identity())
     for module in copied.modules():
         if dtype is not None and isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             module.to(dtype)
     return copied.to(memory_format=torch.channels_last)
 
 
-def _fold(module: nn.Module) -> None:
-    for (name, first), (norm_name, second) in pairwise(list(module.named_children())):
-        if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
-            setattr(module, name, fuse_conv_bn_eval(first, second))  # type: ignore[arg-type]
-            setattr(module, norm_name, nn.Identity())
+def foldable(network: nn.Module) -> Iterator[tuple[nn.Module, str, str]]:
+    """Every convolution with a norm right behind it: the module that has both, and their names in it."""
+    for module in network.modules():
+        for (name, first), (norm_name, second) in pairwise(module.named_children()):
+            if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
+                yield module, name, norm_name

@@ -173,7 +173,8 @@ class MaskRCNN(nn.Module):
         """
         features = self.features(images)
         sizes = [(images.shape[-2], images.shape[-1])] * len(targets)
-        proposals, loss_objectness, loss_proposal = self.rpn(sizes[0], list(features.values()), targets)
+        pyramid, wanted = list(features.values()), self.config.proposals[0]
+        proposals, loss_objectness, loss_proposal = self.rpn(sizes[0], pyramid, targets, wanted)
         heads = self.roi_heads
         sampled, matched, labels, regression = self._sample(proposals, targets)
         box_features = heads.box_head(heads.box_roi_pool(features, sampled, sizes))

@@ -34,23 +34,22 @@ class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
     where the image was padded for it.
     """
 
-    def __init__(self, finest_stride: int, proposals: tuple[int, int], *args: Any) -> None:
+    def __init__(self, finest_stride: int, *args: Any) -> None:
         super().__init__(*args)
         self.finest_stride = finest_stride
-        self.proposals = proposals
 
     def forward(
-        self, canvas: tuple[int, int], features: list[Tensor], targets: Sequence[Mapping[str, Any]]
+        self, canvas: tuple[int, int], features: list[Tensor], targets: Sequence[Mapping[str, Any]], wanted: int
     ) -> tuple[list[Tensor], Tensor, Tensor]:
         """Proposals of each image [n, 4], canvas px, for training the heads, and the losses of objectness and boxes.
 
-        canvas: (height, width) px of the images; features: of the pyramid, finest first.
+        canvas: (height, width) px of the images; features: of the pyramid, finest first; wanted: proposals at most.
         """
         objectness, deltas = self.head(features)
         height, width = canvas
         limit = objectness[0].new_tensor([[[width, height, width, height]]])
         with torch.no_grad():
-            proposals = self.propose(objectness, deltas, self.proposals[0], limit)
+            proposals = self.propose(objectness, deltas, wanted, limit)
             counts = is_solid(proposals).sum(dim=1).tolist()
         anchors = [torch.cat([self.anchors(level, logits) for level, logits in enumerate(objectness)])] * len(targets)
         labels, boxes = self.assign_targets_to_anchors(anchors, targets)
@@ -104,7 +103,7 @@ def build_rpn(channels: int, scales: Sequence[int], finest_stride: int, proposal
     head = PreciseRPNHead(channels, anchors.num_anchors_per_location()[0])
     top = {"training": proposals[0], "testing": proposals[1]}
     twice = {kind: 2 * n for kind, n in top.items()}
-    return CrowdAwareRPN(finest_stride, proposals, anchors, head, 0.7, 0.3, 256, 0.5, twice, top, _NMS_IOU)
+    return CrowdAwareRPN(finest_stride, anchors, head, 0.7, 0.3, 256, 0.5, twice, top, _NMS_IOU)
 
 
 def decode(deltas: Tensor, boxes: Tensor, weights: tuple[float, ...], limit: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 import json
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import onnx
@@ -12,6 +11,7 @@ from onnx import ModelProto, NodeProto, numpy_helper
 from torch import Tensor, nn
 
 from cohdc_train.models import MaskRCNN, detect, fused
+from cohdc_train.models.fused import foldable
 from cohdc_train.models.staged import FrozenNorm
 from cohdc_train.signature import KEY_CLASSES
 
@@ -44,14 +44,15 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
     numbered = iter(sorted(key for key in stored if isinstance(key, int)))
     if len(layers) != len(stored):
         raise ValueError(f"the file has {len(stored)} layers, the network {len(layers)}")
-    norms = _norms(network)
+    norms = {getattr(module, name): getattr(module, norm) for module, name, norm in foldable(network)}
     own = dict(network.named_modules())
     for name in layers:
         key = name if name in stored else next(numbered, None)
         if key is None:
             raise ValueError(f"the file has no layer {name}")
         weights, bias = stored[key]
-        layer, norm = own[name], norms.get(name)
+        layer = own[name]
+        norm = norms.get(layer)
         if layer.weight.shape != weights.shape:
             raise ValueError(f"layer {name} is {list(weights.shape)} in the file, {list(layer.weight.shape)} here")
         with torch.no_grad():
@@ -76,16 +77,6 @@ def _running(network: MaskRCNN) -> list[str]:
             module.register_forward_pre_hook(lambda _, __, name=name: names.append(name))
     detect(copy, [torch.zeros(3, *network.config.canvas, dtype=torch.uint8)])
     return list(dict.fromkeys(names))
-
-
-def _norms(network: MaskRCNN) -> dict[str, nn.Module]:
-    """Name of a convolution -> the norm that `fused` would fold into it."""
-    found = {}
-    for prefix, module in network.named_modules():
-        for (name, first), (_, second) in pairwise(list(module.named_children())):
-            if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
-                found[f"{prefix}.{name}" if prefix else name] = second
-    return found
 
 
 def _stored(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:

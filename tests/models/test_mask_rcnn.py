@@ -103,7 +103,7 @@ def test_proposals_and_their_losses_are_torchvisions(opinionated, canvas):
         features = opinionated.features(images)
     theirs = RegionProposalNetwork.forward
     generator = torch.random.get_rng_state()
-    proposals, objectness, boxes = rpn(canvas, list(features.values()), targets)
+    proposals, objectness, boxes = rpn(canvas, list(features.values()), targets, opinionated.config.proposals[0])
     torch.random.set_rng_state(generator)
     expected, losses = theirs(rpn, ImageList(torch.zeros(2, 3, 96, 128), [canvas] * 2), features, targets)
     torch.testing.assert_close(objectness, losses["loss_objectness"])
@@ -212,7 +212,7 @@ def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
     with torch.autocast("cpu", torch.bfloat16):
         losses = network.losses(torch.rand(1, 3, 96, 1024), targets)
         features = network.features(torch.rand(1, 3, 96, 1024))
-        proposals, *_ = network.rpn((96, 1024), list(features.values()), targets)
+        proposals, *_ = network.rpn((96, 1024), list(features.values()), targets, 100)
         sampled, _, _, _ = network._sample(proposals, targets)
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert features["0"].dtype == torch.bfloat16
