@@ -24,6 +24,15 @@ _MASK_BAND = 2  # px beside the mask where depth is refused
 
 
 @dataclass(frozen=True)
+class Corners:
+    """Where n corners lie in an image, and what they look like; fields as those of Features."""
+
+    pixels: NDArray[np.float64]
+    octaves: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
 class Features:
     """n corners of one frame.
 
@@ -74,6 +83,10 @@ class FeatureExtractor:
 
         lag: [4, 4] from the camera's frame at the colour image's time to that at depth's, where they differ.
         """
+        return self.measure(self.find(rgb, mask), depth, mask, lag)
+
+    def find(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Corners:
+        """The corners alone; arguments as above."""
         gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found, table = self._detect(gray, allowed)
@@ -83,11 +96,22 @@ class FeatureExtractor:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
         pixels += 0.5 * (_SCALES[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
+        return Corners(pixels, octaves, np.ascontiguousarray(words).view(np.uint64))
+
+    def measure(
+        self,
+        corners: Corners,
+        depth: NDArray[np.float32],
+        mask: NDArray[np.bool_] | None = None,
+        lag: NDArray[np.float64] | None = None,
+    ) -> Features:
+        """What camera and depth image say of corners; arguments as above."""
+        pixels = corners.pixels
         points = self.camera.undistort(pixels)
         depths = sample_depth(depth, pixels, mask)
         if lag is not None:
             depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
-        return Features(pixels, points, octaves, np.ascontiguousarray(words).view(np.uint64), depths)
+        return Features(pixels, points, corners.octaves, corners.descriptors, depths)
 
     def _caught_up(
         self,

@@ -15,6 +15,7 @@ class Method:
         static_weights: groups of points that do not move with the rest are left out, and count less from then on.
         global_adjustment: when the sequence is over, all keyframes are bundle-adjusted at once.
         keyframe_culling: a keyframe leaves the map when three others see nine in ten of its points as well.
+        flow: in real time two of three frames are tracked by optical flow from the third, which is matched to the map.
     """
 
     loops: bool = True
@@ -23,3 +24,4 @@ class Method:
     static_weights: bool = True
     global_adjustment: bool = True
     keyframe_culling: bool = True
+    flow: bool = True

@@ -12,7 +12,8 @@ from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import dynamic_mask_of
-from cohdc_train.slam.features import FeatureExtractor, Features
+from cohdc_train.slam.features import Corners, FeatureExtractor, Features
+from cohdc_train.slam.flow_tracking import FlowTracker
 from cohdc_train.slam.geometry import Geometry
 from cohdc_train.slam.keyframe_culling import cull_keyframes
 from cohdc_train.slam.localization import LOCAL_KEYFRAMES, Fit, Localizer, thumbnail
@@ -79,6 +80,7 @@ class Tracker:
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
+        self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
         self._velocity = np.zeros(6)  # logarithm of the last frame's T_cw times the inverse of the one's before
         self._last: Fit | None = None
         self._reference_inliers = 0
@@ -102,8 +104,13 @@ class Tracker:
         """
         start = time.perf_counter()
         self._take_in_mapping()
-        mask = self.mask = self._dynamic(mask, depth_m, t)
         late = None if depth_t is None else depth_t - t
+        fit = self._by_flow(rgb, depth_m, t, mask, late)
+        if fit is not None:
+            tracked = time.perf_counter()
+            self._remember(fit, t, False)
+            return _pose_of(fit, t, False, start, tracked)
+        mask = self.mask = self._dynamic(mask, depth_m, t)
         features = self._corners(rgb, depth_m, mask, late)
         fit = self._locate(features, rgb, t)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
@@ -119,11 +126,10 @@ class Tracker:
                 fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
             if self.method.keyframe_culling:
                 self._cull_keyframes()
-        self._remember(fit, t)
-        inliers = 0 if fit is None else len(fit.matches)
-        mapped = time.perf_counter()
-        T_wc = None if fit is None else inverse(fit.T_cw)
-        return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (mapped - tracked))
+        if self._flow is not None:
+            self._flow.begin(rgb, features, fit)
+        self._remember(fit, t, True)
+        return _pose_of(fit, t, keyframe, start, tracked)
 
     def finish(self) -> None:
         """Wait for mapping that runs beside tracking, and adjust the whole map; the trajectory is better for it."""
@@ -147,6 +153,28 @@ class Tracker:
         poses = [inverse(relative @ keyframes[index]) for _, index, relative in self._log]
         return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
 
+    def _by_flow(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        t: float,
+        mask: NDArray[np.bool_] | None,
+        late: float | None,
+    ) -> Fit | None:
+        """The pose by what the last matched frame saw; None where this one is to be matched."""
+        if self._flow is None or self._last is None:
+            return None
+        expected = self._motion(t) @ self._last.T_cw
+        followed = self._flow.follow(rgb, mask, expected)
+        if followed is None:
+            return None
+        features = self._measured(followed.corners, depth_m, mask, late)
+        fit = self._flow.locate(followed, features, expected)
+        if fit is None:
+            return None
+        self.features, self.mask = features, mask
+        return fit
+
     def _dynamic(
         self, mask: NDArray[np.bool_] | None, depth_m: NDArray[np.float32], t: float
     ) -> NDArray[np.bool_] | None:
@@ -159,10 +187,15 @@ class Tracker:
     def _corners(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
     ) -> Features:
+        return self._measured(self._extract.find(rgb, mask), depth_m, mask, late)
+
+    def _measured(
+        self, corners: Corners, depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
+    ) -> Features:
         """The corners of a frame, all put at its one time; late: s by which depth was taken after colour."""
         twist = self._twist()
         lag = None if twist is None or late is None else exp_se3(twist * late)
-        features = self._extract(rgb, depth_m, mask, lag)
+        features = self._extract.measure(corners, depth_m, mask, lag)
         return features if twist is None else unrolled(features, self.camera, twist)
 
     def _twist(self) -> Array | None:
@@ -243,14 +276,14 @@ class Tracker:
             self._last = Fit(moved, self._last.matches)
         return _fit_of(keyframe)
 
-    def _remember(self, fit: Fit | None, t: float) -> None:
+    def _remember(self, fit: Fit | None, t: float, matched: bool) -> None:
         if fit is None or fit.reference is None:
             self._last = None
             self._velocity = np.zeros(6)
             return
         self._velocity = np.zeros(6) if self._last is None else log_se3(fit.T_cw @ inverse(self._last.T_cw))
         self._last = fit
-        if self._since_keyframe > 0:
+        if self._since_keyframe > 0 and matched:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
         self._log.append((t, fit.reference.index, fit.T_cw @ inverse(fit.reference.T_cw)))
@@ -259,3 +292,9 @@ class Tracker:
 def _fit_of(keyframe: Keyframe) -> Fit:
     corners = np.flatnonzero(keyframe.point_ids >= 0)
     return Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners), keyframe)
+
+
+def _pose_of(fit: Fit | None, t: float, keyframe: bool, start: float, tracked: float) -> Pose:
+    """start, tracked: when work on the frame began, and when its pose was found."""
+    T_wc, inliers = (None, 0) if fit is None else (inverse(fit.T_cw), len(fit.matches))
+    return Pose(t, T_wc, keyframe, inliers, 1e3 * (tracked - start), 1e3 * (time.perf_counter() - tracked))

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
-from cohdc_train.slam.features import Features
+from cohdc_train.slam.features import Corners, Features
 from cohdc_train.slam.matching import Matches, Projected, match_projected, one_to_one
 from cohdc_train.slam.optimization import exp_se3, inverse
 from cohdc_train.slam.tracking import Pose, Tracker
@@ -113,18 +113,18 @@ def test_a_picture_matched_whole_takes_depth_at_its_own_time_too(
     tracker = Tracker(CAMERA, features=500)
     for index, (rgb, depth, _) in enumerate(views[:4]):
         tracker.track(rgb, depth, index / 30)
-    extract, lags = tracker._extract, []
+    measure, lags = tracker._extract.measure, []
 
     def watched(
-        rgb: NDArray[np.uint8],
+        corners: Corners,
         depth: NDArray[np.float32],
         mask: NDArray[np.bool_] | None,
         lag: NDArray[np.float64] | None,
     ) -> Features:
         lags.append(lag)
-        return extract(rgb, depth, mask, lag)
+        return measure(corners, depth, mask, lag)
 
-    monkeypatch.setattr(tracker, "_extract", watched)
+    monkeypatch.setattr(tracker._extract, "measure", watched)
     assert tracker.track(*views[4][:2], 4 / 30, EVERYTHING, depth_t=4 / 30 + 0.01).tracked
     assert len(lags) == 2, "first what is not masked, then all"
     assert lags[0] is not None

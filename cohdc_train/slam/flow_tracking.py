@@ -1,0 +1,118 @@
+"""Frames between two that are matched against the map: optical flow finds the points that the last matched one saw.
+
+Corners, descriptors and the search for both take most of a frame's time. A thirtieth of a second later the same points
+are a few pixels on, and the patch around each says where. Flow starts from the matched frame every time, never from a
+frame that was itself tracked by it, so that nothing adds up.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.features import Corners, Features
+from cohdc_train.slam.localization import Fit
+from cohdc_train.slam.map import Map, observations
+from cohdc_train.slam.matching import Matches
+from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, to_local
+
+_BETWEEN = 2  # frames in a row: ten times a second the map is consulted
+_WINDOW = (13, 13)  # px of a patch
+_LEVELS = 2  # of the image pyramid above the image itself
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+_LEAST = 50  # points that agree on a pose
+_SHARE = 0.6  # of the points that set out: where fewer agree, much has changed
+_NEAR = 0.05  # m
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A matched frame. gray: [H, W] uint8; corners: those that are matched, in the order of the fit's matches."""
+
+    gray: NDArray[np.uint8]
+    corners: Corners
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Points that flow found. ids: [m] int64, of the map; corners: where they are, m of them."""
+
+    ids: NDArray[np.int64]
+    corners: Corners
+
+
+class FlowTracker:
+    """The poses of up to two frames after every matched one, without corners of their own."""
+
+    def __init__(self, world: Map, weighing: Weighing) -> None:
+        self.map = world
+        self._weighing = weighing
+        self._start: _Start | None = None
+        self._left = 0
+
+    def begin(self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None) -> None:
+        """A frame has been matched: what it sees is followed from now on. fit: None when the place is lost."""
+        self._start, self._left = None, _BETWEEN
+        if fit is None or len(fit.matches) < _LEAST:
+            return
+        rows = fit.matches.corners
+        corners = Corners(features.pixels[rows], features.octaves[rows], features.descriptors[rows])
+        self._start = _Start(_gray(rgb), corners, fit)
+
+    def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
+        """Look for the points in the next frame; None when it is to be matched.
+
+        rgb: [H, W, 3]; mask: [H, W] bool, True = dynamic: nothing is followed to there; T_cw: [4, 4] expected pose.
+        """
+        if self._start is None or self._left == 0:
+            return None
+        self._left -= 1
+        before = self._start
+        shift = self._seen_from(T_cw) - self._seen_from(before.fit.T_cw)
+        guess = (before.corners.pixels + shift).astype(np.float32)
+        starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
+        found, status, _ = cv2.calcOpticalFlowPyrLK(
+            before.gray, _gray(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
+        )
+        pixels = np.asarray(found, dtype=np.float64)
+        rows = np.flatnonzero((status[:, 0] > 0) & _usable(pixels, self.map.camera, mask))
+        corners = Corners(pixels[rows], before.corners.octaves[rows], before.corners.descriptors[rows])
+        return Followed(before.fit.matches.points[rows], corners)
+
+    def locate(self, followed: Followed, features: Features, T_cw: Array) -> Fit | None:
+        """The pose on which enough of the points agree. features: of the followed corners; T_cw: [4, 4] expected."""
+        assert self._start is not None
+        least = max(_LEAST, _SHARE * len(self._start.fit.matches))
+        if len(features) < least:
+            return None
+        matches = Matches(followed.ids, np.arange(len(features)))
+        seen = observations(features, matches.corners, self.map.trust(matches.points))
+        T_cw, inlier = optimize_pose(T_cw, self.map.positions[matches.points], seen, self._weighing)
+        if inlier.sum() < least:
+            return None
+        return Fit(T_cw, matches.take(inlier), self._start.fit.reference)
+
+    def _seen_from(self, T_cw: Array) -> Array:
+        """[m, 2] px as the lens shows them, of the points that are followed."""
+        assert self._start is not None
+        local = to_local(T_cw, self.map.positions[self._start.fit.matches.points])
+        local[:, 2] = np.maximum(local[:, 2], _NEAR)
+        camera = self.map.camera
+        return camera.distort(camera.project(local))
+
+
+def _gray(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _usable(pixels: Array, camera: Camera, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """[m] bool: inside the image and not under the mask. pixels: [m, 2]."""
+    x, y = np.rint(pixels).T
+    inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    if mask is None:
+        return np.asarray(inside)
+    columns, rows = np.where(inside, x, 0).astype(np.int64), np.where(inside, y, 0).astype(np.int64)
+    return np.asarray(inside & ~mask[rows, columns])

@@ -1,0 +1,167 @@
+"""Frames that optical flow tracks between two that are matched against the map."""
+
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from plane_world import CAMERA, camera_path, passer_by, render, room
+
+from cohdc_train.slam.features import Corners
+from cohdc_train.slam.flow_tracking import FlowTracker
+from cohdc_train.slam.method import Method
+from cohdc_train.slam.optimization import exp_se3
+from cohdc_train.slam.tracking import Pose, Tracker
+from cohdc_train.trajectory import Trajectory, score
+
+FRAMES = 31
+View = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
+
+
+class AtOnce(Executor):
+    """An executor that does not run beside anything, so that its results do not depend on time."""
+
+    def submit(self, function: Any, /, *args: Any, **kwargs: Any) -> "Future[Any]":
+        job: Future[Any] = Future()
+        job.set_result(function(*args, **kwargs))
+        return job
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    """A still room along a path."""
+    return [render(room(), T_wc) for T_wc in camera_path(FRAMES)]
+
+
+class Watched:
+    """A tracker in real time that says which frames were searched for corners."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, flow: bool = True) -> None:
+        self.tracker = Tracker(CAMERA, 500, method=Method(flow=flow, global_adjustment=False), executor=AtOnce())
+        self.searched: list[int] = []
+        self.poses: list[Pose] = []
+        find = self.tracker._extract.find
+
+        def noted(*arguments: Any) -> Corners:
+            self.searched.append(len(self.poses))
+            return find(*arguments)
+
+        monkeypatch.setattr(self.tracker._extract, "find", noted)
+
+    def track(self, view: View, mask: NDArray[np.bool_] | None = None) -> Pose:
+        self.poses.append(self.tracker.track(view[0], view[1], len(self.poses) / 30, mask))
+        return self.poses[-1]
+
+    def ate(self) -> float:
+        """RMSE, m."""
+        truth = Trajectory(np.arange(FRAMES) / 30, camera_path(FRAMES))
+        return score(truth, Trajectory(*self.tracker.trajectory()))["ate_m"]["rmse"]
+
+
+def test_two_of_three_frames_need_no_corners_and_are_as_exact(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flow, matched = Watched(monkeypatch), Watched(monkeypatch, flow=False)
+    for view in views:
+        flow.track(view)
+        matched.track(view)
+    assert matched.searched == list(range(FRAMES))
+    assert flow.searched == list(range(0, FRAMES, 3))
+    assert all(pose.tracked for pose in flow.poses)
+    assert not any(pose.keyframe for index, pose in enumerate(flow.poses) if index % 3)
+    assert sum(pose.keyframe for pose in flow.poses) <= sum(pose.keyframe for pose in matched.poses)
+    assert flow.ate() < 0.004
+    assert flow.ate() < 1.25 * matched.ate()
+
+
+def test_the_same_frames_give_the_same_bits(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    ways = []
+    for _ in range(2):
+        run = Watched(monkeypatch)
+        for view in views[:12]:
+            run.track(view)
+        ways.append(run.tracker.trajectory()[1].tobytes())
+    assert ways[0] == ways[1]
+
+
+def test_without_an_executor_every_frame_is_matched(views: list[View]) -> None:
+    assert Tracker(CAMERA, 500)._flow is None
+    assert Tracker(CAMERA, 500, executor=AtOnce())._flow is not None
+
+
+def test_where_flow_finds_too_little_the_frame_is_matched(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A leap of ten frames lies beyond what flow can reach, but not beyond the map's."""
+    run = Watched(monkeypatch)
+    for view in views[:4]:
+        run.track(view)
+    run.tracker._velocity[:] = 0
+    assert run.track(views[20]).tracked
+    assert run.searched == [0, 3, 4]
+    found = run.poses[-1].T_wc
+    assert found is not None
+    relative = np.linalg.inv(camera_path(FRAMES)[0]) @ camera_path(FRAMES)[20]
+    np.testing.assert_allclose(found[:3, 3], relative[:3, 3], atol=0.01)
+
+
+def test_a_lost_place_is_followed_by_no_flow(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Watched(monkeypatch)
+    nothing = np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]
+    states = [run.track(nothing if index in (4, 5) else view).tracked for index, view in enumerate(views[:9])]
+    assert states == [True] * 4 + [False] * 2 + [True] * 3
+    assert run.searched[:5] == [0, 3, 4, 5, 6]
+
+
+def test_nothing_is_followed_under_a_mask_and_a_passer_by_does_not_drag_the_pose(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """He is masked when frames are matched, but walks over points that flow follows."""
+    run, path = Watched(monkeypatch), camera_path(FRAMES)
+    under_mask = 0
+    for index in range(FRAMES):
+        view = render([*room(), passer_by(index)], path[index])
+        masked = index % 3 != 1
+        run.track(view, view[2] if masked else None)
+        assert run.tracker.features is not None
+        x, y = np.rint(run.tracker.features.pixels).astype(int).T
+        under_mask += np.count_nonzero(view[2][y, x]) if masked else 0
+    assert run.searched == list(range(0, FRAMES, 3))
+    assert under_mask == 0
+    assert run.ate() < 0.005
+
+
+def test_flow_sets_out_from_where_the_motion_leads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wall moves by 20 px from frame to frame, and by 40 until the next matched one."""
+    path = exp_se3(np.outer(np.arange(10) - 5, [0.18, 0.0, 0.01, 0.0, 0.01, 0.0]))
+    run = Watched(monkeypatch)
+    assert all(run.track(render(room(), T_wc)).tracked for T_wc in path)
+    assert run.searched == [0, 1, 4, 7], "the first motion is known to nobody"
+
+
+def begun(view: View) -> tuple[FlowTracker, Tracker]:
+    """A flow that sets out from the first frame of a map."""
+    tracker = Tracker(CAMERA, 500, executor=AtOnce())
+    tracker.track(view[0], view[1], 0.0)
+    assert tracker._flow is not None
+    return tracker._flow, tracker
+
+
+def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
+    flow, tracker = begun(views[0])
+    followed = flow.follow(views[0][0], None, np.eye(4))
+    assert followed is not None
+    features = tracker._extract.measure(followed.corners, views[0][1])
+    fit = flow.locate(followed, features, np.eye(4))
+    assert fit is not None
+    np.testing.assert_allclose(fit.T_cw, np.eye(4), atol=1e-4)
+    shifted = features.points.copy()
+    shifted[: len(shifted) // 2, 0] += 30
+    assert flow.locate(followed, replace(features, points=shifted), np.eye(4)) is None
+
+
+def test_no_flow_sets_out_from_a_frame_without_a_pose(views: list[View]) -> None:
+    flow, tracker = begun(views[0])
+    assert tracker.features is not None
+    flow.begin(views[1][0], tracker.features, None)
+    assert flow.follow(views[1][0], None, np.eye(4)) is None
