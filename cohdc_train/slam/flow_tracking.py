@@ -16,7 +16,8 @@ from cohdc_train.slam.features import Corners, Features
 from cohdc_train.slam.localization import Fit
 from cohdc_train.slam.map import Map, observations
 from cohdc_train.slam.matching import Matches
-from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, to_local
+from cohdc_train.slam.motion import Expectation
+from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
 
 _BETWEEN = 2  # frames in a row: ten times a second the map is consulted
 _WINDOW = (13, 13)  # px of a patch
@@ -82,18 +83,21 @@ class FlowTracker:
         corners = Corners(pixels[rows], before.corners.octaves[rows], before.corners.descriptors[rows])
         return Followed(before.fit.matches.points[rows], corners)
 
-    def locate(self, followed: Followed, features: Features, T_cw: Array) -> Fit | None:
-        """The pose on which enough of the points agree. features: of the followed corners; T_cw: [4, 4] expected."""
+    def locate(self, followed: Followed, features: Features, expected: Expectation) -> Fit | None:
+        """The pose on which enough of the points agree. features: of the followed corners."""
         assert self._start is not None
         least = max(_LEAST, _SHARE * len(self._start.fit.matches))
         if len(features) < least:
             return None
         matches = Matches(followed.ids, np.arange(len(features)))
         seen = observations(features, matches.corners, self.map.trust(matches.points))
-        T_cw, inlier = optimize_pose(T_cw, self.map.positions[matches.points], seen, self._weighing)
+        points = self.map.positions[matches.points]
+        prior = expected.given(len(features))
+        T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < least:
             return None
-        return Fit(T_cw, matches.take(inlier), self._start.fit.reference)
+        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
+        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, information, prior is not None)
 
     def _seen_from(self, T_cw: Array) -> Array:
         """[m, 2] px as the lens shows them, of the points that are followed."""

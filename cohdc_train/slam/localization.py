@@ -1,6 +1,6 @@
 """The pose of one frame against the map: from the last pose, or from nothing when the place was lost."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from cohdc_train.slam.features import Features
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
-from cohdc_train.slam.optimization import Array, Observations, Weighing, optimize_pose
+from cohdc_train.slam.motion import Expectation
+from cohdc_train.slam.optimization import Array, Observations, Weighing, optimize_pose, pose_information
 from cohdc_train.slam.ransac import ransac_pose
 from cohdc_train.slam.rigidity import pose_of_rest
 
@@ -23,11 +24,14 @@ _CANDIDATES = 6  # keyframes tried per lost frame
 @dataclass(frozen=True)
 class Fit:
     """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference: the keyframe that
-    sees most of them, None while the pose is a rough one."""
+    sees most of them, None while the pose is a rough one; information: [6, 6] inverse covariance of the pose by what is
+    seen alone, in the camera's frame, 0 of a rough one; weighed: what was expected has counted in T_cw as well."""
 
     T_cw: Array
     matches: Matches
     reference: Keyframe | None = None
+    information: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    weighed: bool = False
 
 
 class Localizer:
@@ -39,12 +43,12 @@ class Localizer:
         self._judges = judges
         self._rng = np.random.default_rng(seed)
 
-    def near(self, features: Features, rgb: NDArray[np.uint8], last: Fit, velocity: Array) -> Fit | None:
-        """The frame after `last`. velocity: [4, 4], T_cw of the expected pose times the inverse of the last one's."""
-        rough = self._follow(features, last, velocity)
+    def near(self, features: Features, rgb: NDArray[np.uint8], last: Fit, expected: Expectation) -> Fit | None:
+        """The frame after `last`. Where it sees little, what was expected counts as well."""
+        rough = self._follow(features, last, expected)
         if rough is None:
             return self.anywhere(features, rgb)
-        return self._against_local_map(features, rough, _MIN_TRACKED)
+        return self._against_local_map(features, rough, _MIN_TRACKED, expected)
 
     def anywhere(self, features: Features, rgb: NDArray[np.uint8]) -> Fit | None:
         """Try the keyframes that look most like the frame, and the newest."""
@@ -60,9 +64,9 @@ class Localizer:
                 return fit
         return None
 
-    def _follow(self, features: Features, last: Fit, velocity: Array) -> Fit | None:
+    def _follow(self, features: Features, last: Fit, expected: Expectation) -> Fit | None:
         """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
-        for guess, radius in ((velocity @ last.T_cw, 15.0), (last.T_cw, 40.0)):
+        for guess, radius in ((expected.prior.T_cw, 15.0), (last.T_cw, 40.0)):
             projected = self.map.project(last.matches.points, guess)
             matches = match_projected(projected, features, radius)
             fit = self._solve(features, matches, guess, hypotheses=64)
@@ -82,25 +86,29 @@ class Localizer:
         T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing, rounds=1)
         return Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
 
-    def _against_local_map(self, features: Features, rough: Fit, minimum: int) -> Fit | None:
+    def _against_local_map(
+        self, features: Features, rough: Fit, minimum: int, expected: Expectation | None = None
+    ) -> Fit | None:
         """The final pose, from all points of the keyframes around."""
         keyframes = self.map.covisible(rough.matches.points, LOCAL_KEYFRAMES)
         projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
         matches = match_projected(projected, features, radius=5.0)
         points, seen = self._seen(features, matches)
+        prior = None if expected is None else expected.given(len(matches))
         moving = np.zeros(len(matches), dtype=np.bool_)
         if self._judges:
             found = self.map.found[matches.points]
-            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing, found)
+            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing, found, prior)
         else:
-            T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing)
+            T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < minimum:
             return None
         self.map.judge(matches.points[inlier], matches.points[moving])
         matches = matches.take(inlier)
+        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
-        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0])
+        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], information, prior is not None)
 
     def _seen(self, features: Features, matches: Matches) -> tuple[Array, Observations]:
         """Where the map has the matched points, [m, 3] m, and what the frame measured of them."""

@@ -57,6 +57,22 @@ class Weighing:
     bf: float = 100.0
 
 
+@dataclass(frozen=True)
+class Prior:
+    """A pose as it was expected. T_cw: [4, 4] world to camera, m; information: [6, 6] inverse covariance of the small
+    motion (m, rad) in the camera's frame that leads from it to the true one."""
+
+    T_cw: Array
+    information: Array
+
+    def pull(self, T_cw: Array) -> Array:
+        """[6] gradient, at T_cw, of half the squared distance in sigmas; to first order in the rotation between."""
+        between = T_cw @ inverse(self.T_cw)
+        turn = np.asarray(cv2.Rodrigues(between[:3, :3])[0])[:, 0]
+        way = between[:3, 3] - 0.5 * np.cross(turn, between[:3, 3])
+        return np.asarray(self.information @ np.concatenate([way, turn]))
+
+
 def exp_se3(xi: Array) -> Array:
     """xi: [..., 6] (translation part, rotation vector rad). Returns [..., 4, 4]."""
     rho, phi = xi[..., :3], xi[..., 3:]
@@ -159,7 +175,7 @@ def huber_weights(chi2: Array, limits: Array) -> Array:
 
 
 def optimize_pose(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, rounds: int = 2
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, rounds: int = 2, prior: Prior | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Gauss-Newton on the six parameters of a pose, Huber-weighted; outliers are dropped and may return every round.
 
@@ -170,12 +186,23 @@ def optimize_pose(
     for _ in range(rounds):
         if used.sum() < 6:
             break
-        T_cw = _refine(T_cw, points[used], seen.take(used), weighing)
+        T_cw = _refine(T_cw, points[used], seen.take(used), weighing, prior)
         used = chi_square(T_cw, points, seen, weighing) <= limits
     return T_cw, used
 
 
-def _refine(T_cw: Array, points: Array, seen: Observations, weighing: Weighing, steps: int = 8) -> Array:
+def pose_information(T_cw: Array, points: Array, seen: Observations, weighing: Weighing) -> Array:
+    """[6, 6] inverse covariance of a pose that these measurements decide; arguments as of optimize_pose."""
+    local = to_local(T_cw, points)
+    J = np.zeros((6, 3, len(points)))
+    _fill_pose_jacobian(J, local, seen, weighing)
+    rows = J.reshape(6, -1)
+    return np.asarray(rows @ rows.T)
+
+
+def _refine(
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, prior: Prior | None, steps: int = 8
+) -> Array:
     limits = seen.limits
     J = np.zeros((6, 3, len(points)))
     for _ in range(steps):
@@ -185,7 +212,10 @@ def _refine(T_cw: Array, points: Array, seen: Observations, weighing: Weighing, 
         weight[local[:, 2] <= _NEAR] = 0.0
         _fill_pose_jacobian(J, local, seen, weighing)
         rows, weighted = J.reshape(6, -1), (J * weight).reshape(6, -1)
-        step = np.linalg.solve(weighted @ rows.T + 1e-9 * np.eye(6), -(weighted @ error.reshape(-1)))
+        H, g = weighted @ rows.T + 1e-9 * np.eye(6), weighted @ error.reshape(-1)
+        if prior is not None:
+            H, g = H + prior.information, g + prior.pull(T_cw)
+        step = np.linalg.solve(H, -g)
         turn = np.asarray(cv2.Rodrigues(step[3:])[0])
         T_cw = T_cw.copy()
         T_cw[:3] = turn @ T_cw[:3]

@@ -16,6 +16,7 @@ from scipy.cluster.hierarchy import linkage
 from cohdc_train.slam.optimization import (
     Array,
     Observations,
+    Prior,
     Weighing,
     huber_weights,
     optimize_pose,
@@ -35,15 +36,21 @@ _ROUNDS = 4  # groups taken out, one after the other
 
 
 def pose_of_rest(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, found: NDArray[np.int64]
+    T_cw: Array,
+    points: Array,
+    seen: Observations,
+    weighing: Weighing,
+    found: NDArray[np.int64],
+    prior: Prior | None = None,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """The pose from the points that hold together, after those that move as groups were taken out.
 
-    T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more.
+    T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more;
+    prior: where the camera was expected; groups are judged without it.
     Returns the pose, [m] bool inliers and [m] bool members of moving groups.
     """
     moving = np.zeros(len(points), dtype=np.bool_)
-    T_cw, inlier = optimize_pose(T_cw, points, seen, weighing)
+    T_cw, inlier = optimize_pose(T_cw, points, seen, weighing, prior=prior)
     for _ in range(_ROUNDS):
         rest = np.flatnonzero(~moving)
         group = moving_group(T_cw, points[rest], seen.take(rest), weighing, found[rest])
@@ -51,7 +58,7 @@ def pose_of_rest(
             break
         moving[rest[group]] = True
         rest = np.flatnonzero(~moving)
-        T_cw, agrees = optimize_pose(T_cw, points[rest], seen.take(rest), weighing)
+        T_cw, agrees = optimize_pose(T_cw, points[rest], seen.take(rest), weighing, prior=prior)
         inlier = np.zeros(len(points), dtype=np.bool_)
         inlier[rest[agrees]] = True
     return T_cw, inlier, moving

@@ -2,7 +2,7 @@
 
 import time
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,7 +22,8 @@ from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse, log_se3
+from cohdc_train.slam.motion import Motion
+from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse
 from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.shutter import unrolled
 from cohdc_train.slam.window import adjust_everything
@@ -33,7 +34,7 @@ _KEYFRAME_FRAMES = 20
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
-_LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
+_CERTAIN = 1e9  # information of the first pose, which is where the world begins
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class Tracker:
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
-        self._velocity = np.zeros(6)  # logarithm of the last frame's T_cw times the inverse of the one's before
+        self._motion = Motion()
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
@@ -108,6 +109,7 @@ class Tracker:
         fit = self._by_flow(rgb, depth_m, t, mask, late)
         if fit is not None:
             tracked = time.perf_counter()
+            self._motion.found(t, fit.T_cw, fit.information, fit.weighed)
             self._remember(fit, t, False)
             return _pose_of(fit, t, False, start, tracked)
         mask = self.mask = self._dynamic(mask, depth_m, t)
@@ -120,12 +122,16 @@ class Tracker:
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
+        if fit is not None:
+            self._motion.found(t, fit.T_cw, fit.information, fit.weighed)
         if fit is not None and keyframe:
+            before = fit.T_cw
             fit = self._add_keyframe(features, fit, t, rgb, depth_m)
             if self._loops is not None:
                 fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
             if self.method.keyframe_culling:
                 self._cull_keyframes()
+            self._motion.carry(inverse(before) @ fit.T_cw)
         if self._flow is not None:
             self._flow.begin(rgb, features, fit)
         self._remember(fit, t, True)
@@ -164,8 +170,8 @@ class Tracker:
         """The pose by what the last matched frame saw; None where this one is to be matched."""
         if self._flow is None or self._last is None:
             return None
-        expected = self._motion(t) @ self._last.T_cw
-        followed = self._flow.follow(rgb, mask, expected)
+        expected = self._motion.expected(t)
+        followed = self._flow.follow(rgb, mask, expected.prior.T_cw)
         if followed is None:
             return None
         features = self._measured(followed.corners, depth_m, mask, late)
@@ -182,7 +188,7 @@ class Tracker:
         if not self.method.geometry or self._last is None:
             return mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return dynamic_mask_of(self._geometry, mask, depth_m, self._motion(t) @ self._last.T_cw, around, t)
+        return dynamic_mask_of(self._geometry, mask, depth_m, self._motion.expected(t).prior.T_cw, around, t)
 
     def _corners(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
@@ -193,44 +199,27 @@ class Tracker:
         self, corners: Corners, depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
     ) -> Features:
         """The corners of a frame, all put at its one time; late: s by which depth was taken after colour."""
-        twist = self._twist()
+        twist = self._motion.twist
         lag = None if twist is None or late is None else exp_se3(twist * late)
         features = self._extract.measure(corners, depth_m, mask, lag)
         return features if twist is None else unrolled(features, self.camera, twist)
-
-    def _twist(self) -> Array | None:
-        """[6] velocity between the last two frames, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t)."""
-        if self._last is None or len(self._log) < 2:
-            return None
-        step = self._log[-1][0] - self._log[-2][0]
-        return self._velocity / step if 0 < step <= _LONGEST else None
-
-    def _motion(self, t: float) -> Array:
-        """[4, 4] T_cw to be expected at t times the inverse of the last one: constant velocity, however long it took.
-
-        After a pause the camera is held to have gone on for as long as its velocity is known to say something.
-        """
-        if len(self._log) < 2:
-            return exp_se3(self._velocity)
-        last = self._log[-1][0]
-        step = last - self._log[-2][0]
-        share = min(t - last, max(step, _LONGEST)) / step if step > 0 else 1.0
-        return exp_se3(share * self._velocity)
 
     def _locate(self, features: Features, rgb: NDArray[np.uint8], t: float) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
-            return Fit(np.eye(4), Matches(empty, empty)) if usable >= MIN_START else None
+            where_the_world_begins = Fit(np.eye(4), Matches(empty, empty), information=_CERTAIN * np.eye(6))
+            return where_the_world_begins if usable >= MIN_START else None
         if self._last is None:
             return self._localizer.anywhere(features, rgb)
-        return self._localizer.near(features, rgb, self._last, self._motion(t))
+        return self._localizer.near(features, rgb, self._last, self._motion.expected(t))
 
     def _take_in_mapping(self) -> None:
         """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
         motion = None if self._mapper is None else self._mapper.collect(self.map)
         if motion is not None and self._last is not None:
-            self._last = Fit(self._last.T_cw @ motion, self._last.matches)
+            self._last = replace(self._last, T_cw=self._last.T_cw @ motion)
+            self._motion.carry(motion)
 
     def _wants_keyframe(self, fit: Fit) -> bool:
         if fit.reference is None:
@@ -267,21 +256,15 @@ class Tracker:
                 self._loops.forget(keyframe)
 
     def _close_loop(self, fit: Fit, loops: LoopCloser, picture: Picture) -> Fit:
-        """The newest keyframe's fit; after a loop the last frame's pose goes along, so that the velocity stays."""
+        """The newest keyframe's fit, after a loop where it is then."""
         keyframe = self.map.keyframes[-1]
-        if not loops.close(keyframe, picture):
-            return fit
-        if self._last is not None:
-            moved = self._last.T_cw @ inverse(fit.T_cw) @ keyframe.T_cw
-            self._last = Fit(moved, self._last.matches)
-        return _fit_of(keyframe)
+        return _fit_of(keyframe) if loops.close(keyframe, picture) else fit
 
     def _remember(self, fit: Fit | None, t: float, matched: bool) -> None:
         if fit is None or fit.reference is None:
             self._last = None
-            self._velocity = np.zeros(6)
+            self._motion.forget()
             return
-        self._velocity = np.zeros(6) if self._last is None else log_se3(fit.T_cw @ inverse(self._last.T_cw))
         self._last = fit
         if self._since_keyframe > 0 and matched:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
