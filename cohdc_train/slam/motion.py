@@ -14,6 +14,7 @@ _ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard devi
 _UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known
 _EXACT = np.repeat([3e-4, 3e-4], 3)  # m and rad: no pose is known better, however many points say so
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
+_SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
 _FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
 _SURPRISE = 100.0  # squared standard deviations of a pose, from which on the velocity is taken anew
@@ -90,7 +91,7 @@ class Motion:
         surprise = float(off @ inverted @ off)
         self._unrest += _LEARNT * (surprise / 6 - self._unrest)
         if surprise > _SURPRISE:
-            self._velocity = log_se3(T_cw @ inverse(self._T_cw)) / self._step
+            self._velocity = log_se3(T_cw @ inverse(self._T_cw)) / max(self._step, _SHORTEST)
             self._T_cw, self._covariance = T_cw, _joint(seen)
             return
         gain = covariance[:, :6] @ inverted

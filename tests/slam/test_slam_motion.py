@@ -84,6 +84,28 @@ def test_a_leap_is_believed_and_the_velocity_is_then_unknown_again() -> None:
     assert np.all(unsure < sure / 20)
 
 
+def test_two_frames_of_one_stamp_leave_all_numbers_finite() -> None:
+    motion = moved([k * STEP for k in range(12)])
+    for leap in (0.0, 0.3):
+        motion.found(11 * STEP, exp_se3(np.array([leap, 0, 0, 0, 0, 0])) @ at(11 * STEP), SURE)
+        assert motion.twist is None
+        assert np.isfinite(motion.expected(11 * STEP).prior.information).all()
+        assert np.isfinite(motion.expected(12 * STEP).prior.T_cw).all()
+
+
+def test_a_shaken_camera_is_not_held_to_what_was_expected() -> None:
+    """Given to frames that see little of a steady camera, not of one that is shaken, and again a second later."""
+    motion = moved([k * STEP for k in range(12)])
+    assert motion.expected(12 * STEP).given(100) is not None
+    assert motion.expected(12 * STEP).given(1000) is None
+    for k in range(12, 20):
+        motion.found(k * STEP, exp_se3(np.array([0.01 * (-1) ** k, 0, 0, 0, 0, 0])) @ at(k * STEP), SURE)
+    assert motion.expected(20 * STEP).given(100) is None
+    for k in range(20, 50):
+        motion.found(k * STEP, at(k * STEP), SURE)
+    assert motion.expected(50 * STEP).given(100) is not None
+
+
 def test_errors_are_as_large_as_foreseen() -> None:
     """Cameras shoved at random, seen with noise: squared distances in sigmas from what was expected average 6."""
     rng, squares = np.random.default_rng(0), []
