@@ -30,11 +30,17 @@ _NEAR = 0.05  # m
 
 @dataclass(frozen=True)
 class _Start:
-    """A matched frame. gray: [H, W] uint8; corners: those that are matched, in the order of the fit's matches."""
+    """A matched frame.
+
+    gray: [H, W] uint8; corners: those that are matched, in the order of the fit's matches; off: [m, 2] px by which each
+    lies beside its point's projection; masked: [m] bool, it was matched though a mask was given for it.
+    """
 
     gray: NDArray[np.uint8]
     corners: Corners
     fit: Fit
+    off: Array
+    masked: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -54,14 +60,22 @@ class FlowTracker:
         self._start: _Start | None = None
         self._left = 0
 
-    def begin(self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None) -> None:
-        """A frame has been matched: what it sees is followed from now on. fit: None when the place is lost."""
+    def begin(
+        self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None, mask: NDArray[np.bool_] | None
+    ) -> None:
+        """A frame has been matched: what it sees is followed from now on.
+
+        fit: None when the place is lost; mask: [H, W] bool, as it was given. What has been matched under it all the
+        same, because it is at rest, may be followed there.
+        """
         self._start, self._left = None, _BETWEEN
         if fit is None or len(fit.matches) < _LEAST:
             return
         rows = fit.matches.corners
         corners = Corners(features.pixels[rows], features.octaves[rows], features.descriptors[rows])
-        self._start = _Start(_gray(rgb), corners, fit)
+        off = corners.pixels - self._seen_from(fit.T_cw, fit.matches.points)
+        masked = ~_free(corners.pixels, self.map.camera, mask)
+        self._start = _Start(_gray(rgb), corners, fit, off, masked)
 
     def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
         """Look for the points in the next frame; None when it is to be matched.
@@ -72,14 +86,14 @@ class FlowTracker:
             return None
         self._left -= 1
         before = self._start
-        shift = self._seen_from(T_cw) - self._seen_from(before.fit.T_cw)
-        guess = (before.corners.pixels + shift).astype(np.float32)
+        guess = (self._seen_from(T_cw, before.fit.matches.points) + before.off).astype(np.float32)
         starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             before.gray, _gray(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
         )
         pixels = np.asarray(found, dtype=np.float64)
-        rows = np.flatnonzero((status[:, 0] > 0) & _usable(pixels, self.map.camera, mask))
+        free = _free(pixels, self.map.camera, mask) | (before.masked & _free(pixels, self.map.camera, None))
+        rows = np.flatnonzero((status[:, 0] > 0) & free)
         corners = Corners(pixels[rows], before.corners.octaves[rows], before.corners.descriptors[rows])
         return Followed(before.fit.matches.points[rows], corners)
 
@@ -99,10 +113,9 @@ class FlowTracker:
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
         return Fit(T_cw, matches.take(inlier), self._start.fit.reference, information, prior is not None)
 
-    def _seen_from(self, T_cw: Array) -> Array:
-        """[m, 2] px as the lens shows them, of the points that are followed."""
-        assert self._start is not None
-        local = to_local(T_cw, self.map.positions[self._start.fit.matches.points])
+    def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
+        """[m, 2] px as the lens shows them, of points of the map."""
+        local = to_local(T_cw, self.map.positions[ids])
         local[:, 2] = np.maximum(local[:, 2], _NEAR)
         camera = self.map.camera
         return camera.distort(camera.project(local))
@@ -112,7 +125,7 @@ def _gray(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def _usable(pixels: Array, camera: Camera, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+def _free(pixels: Array, camera: Camera, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
     """[m] bool: inside the image and not under the mask. pixels: [m, 2]."""
     x, y = np.rint(pixels).T
     inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)

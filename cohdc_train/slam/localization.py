@@ -25,7 +25,7 @@ _CANDIDATES = 6  # keyframes tried per lost frame
 class Fit:
     """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference: the keyframe that
     sees most of them, None while the pose is a rough one; information: [6, 6] inverse covariance of the pose by what is
-    seen alone, in the camera's frame, 0 of a rough one; weighed: what was expected has counted in T_cw as well."""
+    seen alone, in the camera's frame, 0 where nobody asks for it; weighed: what was expected has counted as well."""
 
     T_cw: Array
     matches: Matches

@@ -12,12 +12,12 @@ from cohdc_train.slam.optimization import Array, Prior, exp_se3, inverse, log_se
 
 _ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard deviation
 _UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known
-_EXACT = np.repeat([3e-4, 3e-4], 3)  # m and rad: no pose is known better, however many points say so
+_EXACT = np.full(6, 1e-4)  # m and rad: no pose is known better, however many points say so
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
-_SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
+_PAUSE = 10.0  # s, after which nothing more is forgotten
 _FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
-_SURPRISE = 100.0  # squared standard deviations of a pose, from which on the velocity is taken anew
+_SURPRISE = 100.0  # squared standard deviations of a pose, from which on it is a leap
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,17 @@ class Motion:
         what was expected."""
         seen = np.asarray(np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(_EXACT**2), dtype=np.float64)
         if self._t is None:
-            self._T_cw, self._velocity, self._step = T_cw, np.zeros(6), 0.0
-            self._covariance, self._unrest = _joint(seen), 0.0
+            self._begin(T_cw, seen)
+            self._unrest = 0.0
         else:
             self._update(t, T_cw, seen, weighed)
         self._t = t
+
+    def _begin(self, T_cw: Array, seen: Array) -> None:
+        """At a pose of which only itself is known, by the covariance [6, 6] of what was seen."""
+        self._T_cw, self._velocity, self._step = T_cw, np.zeros(6), 0.0
+        self._covariance = np.diag(np.concatenate([np.zeros(6), _UNKNOWN**2]))
+        self._covariance[:6, :6] = seen
 
     def _update(self, t: float, T_cw: Array, seen: Array, weighed: bool) -> None:
         assert self._t is not None
@@ -89,10 +95,9 @@ class Motion:
             off = spread @ expected.information @ off  # by how much more it was before the compromise
         inverted = np.linalg.inv(spread)
         surprise = float(off @ inverted @ off)
-        self._unrest += _LEARNT * (surprise / 6 - self._unrest)
+        self._unrest += _LEARNT * (min(surprise, _SURPRISE) / 6 - self._unrest)
         if surprise > _SURPRISE:
-            self._velocity = log_se3(T_cw @ inverse(self._T_cw)) / max(self._step, _SHORTEST)
-            self._T_cw, self._covariance = T_cw, _joint(seen)
+            self._begin(T_cw, seen)
             return
         gain = covariance[:, :6] @ inverted
         correction = gain @ off
@@ -103,19 +108,12 @@ class Motion:
     def _ahead(self, t: float) -> float:
         """s for which the velocity is held."""
         assert self._t is not None
-        return min(t - self._t, max(self._step, _LONGEST))
+        return min(max(t - self._t, 0.0), max(self._step, _LONGEST))
 
     def _predicted(self, t: float) -> Array:
         """[12, 12] covariance at t, before anything is seen."""
         assert self._t is not None
-        dt, identity = t - self._t, np.eye(6)
+        dt, identity = min(max(t - self._t, 0.0), _PAUSE), np.eye(6)
         step = np.block([[identity, dt * identity], [np.zeros((6, 6)), identity]])
         noise = np.concatenate([dt * dt / 2 * np.diag(_ACCELERATION), dt * np.diag(_ACCELERATION)])
         return np.asarray(step @ self._covariance @ step.T + noise @ noise.T)
-
-
-def _joint(pose: Array) -> Array:
-    """[12, 12] covariance of a pose's [6, 6] and an unknown velocity."""
-    result = np.diag(np.concatenate([np.zeros(6), _UNKNOWN**2]))
-    result[:6, :6] = pose
-    return result

@@ -179,7 +179,8 @@ def optimize_pose(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Gauss-Newton on the six parameters of a pose, Huber-weighted; outliers are dropped and may return every round.
 
-    T_cw: [4, 4] start; points: [m, 3] world, m. Returns the pose and [m] bool, True = inlier at 95 %.
+    T_cw: [4, 4] start; points: [m, 3] world, m; rounds: how often outliers are chosen; prior: what was expected, which
+    counts beside the measurements. Returns the pose and [m] bool, True = inlier at 95 %.
     """
     limits = seen.limits
     used = np.ones(len(points), dtype=np.bool_)

@@ -46,7 +46,7 @@ def pose_of_rest(
     """The pose from the points that hold together, after those that move as groups were taken out.
 
     T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more;
-    prior: where the camera was expected; groups are judged without it.
+    prior: where the camera was expected, which counts in poses, though not in how far a group may lie off.
     Returns the pose, [m] bool inliers and [m] bool members of moving groups.
     """
     moving = np.zeros(len(points), dtype=np.bool_)

@@ -73,7 +73,7 @@ class Tracker:
         self.map = Map(camera)
         self.budget = features
         self.features: Features | None = None  # of the latest frame
-        self.mask: NDArray[np.bool_] | None = None  # of it: as given, less what is at rest, and what geometry found
+        self.mask: NDArray[np.bool_] | None = None  # as given; a matched frame's less what is at rest, and what moves
         self._extract = FeatureExtractor(camera, features)
         self._geometry = Geometry(camera)
         self._refiner = Refiner(self.map) if self.method.refinement else None
@@ -112,7 +112,8 @@ class Tracker:
             self._motion.found(t, fit.T_cw, fit.information, fit.weighed)
             self._remember(fit, t, False)
             return _pose_of(fit, t, False, start, tracked)
-        mask = self.mask = self._dynamic(mask, depth_m, t)
+        given, mask = mask, self._dynamic(mask, depth_m, t)
+        self.mask = mask
         features = self._corners(rgb, depth_m, mask, late)
         fit = self._locate(features, rgb, t)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
@@ -133,7 +134,7 @@ class Tracker:
                 self._cull_keyframes()
             self._motion.carry(inverse(before) @ fit.T_cw)
         if self._flow is not None:
-            self._flow.begin(rgb, features, fit)
+            self._flow.begin(rgb, features, fit, given)
         self._remember(fit, t, True)
         return _pose_of(fit, t, keyframe, start, tracked)
 

@@ -11,6 +11,7 @@ from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.features import Corners
 from cohdc_train.slam.flow_tracking import FlowTracker
+from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.motion import Expectation
 from cohdc_train.slam.optimization import Prior, exp_se3
@@ -88,7 +89,7 @@ def test_the_same_frames_give_the_same_bits(views: list[View], monkeypatch: pyte
     assert ways[0] == ways[1]
 
 
-def test_without_an_executor_every_frame_is_matched(views: list[View]) -> None:
+def test_flow_belongs_to_real_time() -> None:
     assert Tracker(CAMERA, 500)._flow is None
     assert Tracker(CAMERA, 500, executor=AtOnce())._flow is not None
 
@@ -165,5 +166,63 @@ def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
 def test_no_flow_sets_out_from_a_frame_without_a_pose(views: list[View]) -> None:
     flow, tracker = begun(views[0])
     assert tracker.features is not None
-    flow.begin(views[1][0], tracker.features, None)
+    flow.begin(views[1][0], tracker.features, None, None)
     assert flow.follow(views[1][0], None, np.eye(4)) is None
+
+
+def test_what_is_at_rest_under_its_mask_is_followed_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most of a still room is called a person, who after two seconds is taken to be seated: frames 70 and later."""
+    run, mask = Watched(monkeypatch), np.zeros((240, 320), dtype=np.bool_)
+    mask[:, :230] = True
+    view = render(room(), np.eye(4))
+    for _ in range(96):
+        assert run.track(view, mask).tracked
+    assert run.tracker.mask is not None
+    late = [index for index in run.searched if index >= 72]
+    assert np.diff(late).tolist() == [3] * (len(late) - 1)
+    run.track(view, mask)
+    assert run.tracker.features is not None
+    assert np.count_nonzero(run.tracker.features.pixels[:, 0] < 225) > 100
+
+
+def test_few_points_are_weighed_against_what_was_expected(views: list[View]) -> None:
+    flow, tracker = begun(views[0])
+    followed = flow.follow(views[0][0], None, np.eye(4))
+    assert followed is not None
+    features = tracker._extract.measure(followed.corners, views[0][1])
+    assert flow._start is not None
+    some = np.arange(100)
+    few = replace(flow._start.fit, matches=Matches(followed.ids[some], some))
+    flow.begin(views[0][0], features, few, None)
+    again = flow.follow(views[0][0], None, np.eye(4))
+    assert again is not None
+    steady = Expectation(Prior(np.eye(4), 1e12 * np.eye(6)), calm=True)
+    seen = tracker._extract.measure(again.corners, views[0][1])
+    moved = replace(seen, points=seen.points + 0.5)
+    weighed, alone = flow.locate(again, moved, steady), flow.locate(again, moved, STILL)
+    assert weighed is not None
+    assert alone is not None
+    assert (weighed.weighed, alone.weighed) == (True, False)
+    np.testing.assert_allclose(weighed.T_cw, np.eye(4), atol=1e-5)
+    assert np.abs(alone.T_cw - np.eye(4)).max() > 1e-3
+
+
+def test_the_motion_moves_along_with_the_map_and_ends_with_a_loss(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, shift = Watched(monkeypatch), exp_se3(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0]))
+    for view in views[:6]:
+        run.track(view)
+    tracker = run.tracker
+    assert tracker._mapper is not None
+    assert tracker._last is not None
+    before = tracker._last.T_cw
+    monkeypatch.setattr(tracker._mapper, "collect", lambda world: shift)
+    tracker._take_in_mapping()
+    np.testing.assert_allclose(tracker._last.T_cw, before @ shift)
+    np.testing.assert_allclose(tracker._motion.expected(5 / 30).prior.T_cw, before @ shift, atol=0.01)
+    monkeypatch.setattr(tracker._mapper, "collect", lambda world: None)
+    run.track((np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]))
+    run.track((np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]))
+    assert not run.poses[-1].tracked
+    assert tracker._motion.twist is None

@@ -28,8 +28,14 @@ def views() -> list[View]:
 
 
 def run(views: list[View], loops: bool) -> Run:
-    tracker = Tracker(CAMERA, features=250, method=Method(loops=loops))
-    return tracker, [tracker.track(rgb, depth, index / 30) for index, (rgb, depth) in enumerate(views)]
+    """And all the while the motion starts from where the latest frame is, after a loop too."""
+    tracker, poses = Tracker(CAMERA, features=250, method=Method(loops=loops)), []
+    for index, (rgb, depth) in enumerate(views):
+        poses.append(tracker.track(rgb, depth, index / 30))
+        assert tracker._last is not None
+        from_last = tracker._motion.expected(index / 30).prior.T_cw @ inverse(tracker._last.T_cw)
+        assert np.linalg.norm(from_last[:3, 3]) < 0.01, index
+    return tracker, poses
 
 
 @pytest.fixture(scope="module")
