@@ -14,6 +14,7 @@ _ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard devi
 _UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known
 _EXACT = np.full(6, 1e-4)  # m and rad: no pose is known better, however many points say so
 _LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
+_SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
 _PAUSE = 10.0  # s, after which nothing more is forgotten
 _FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
@@ -79,9 +80,12 @@ class Motion:
             self._update(t, T_cw, seen, weighed)
         self._t = t
 
-    def _begin(self, T_cw: Array, seen: Array) -> None:
-        """At a pose of which only itself is known, by the covariance [6, 6] of what was seen."""
-        self._T_cw, self._velocity, self._step = T_cw, np.zeros(6), 0.0
+    def _begin(self, T_cw: Array, seen: Array, velocity: Array | None = None) -> None:
+        """At a pose, known by the covariance [6, 6] of what was seen, with a velocity of which little is known."""
+        self._T_cw = T_cw
+        if velocity is None:
+            self._step = 0.0
+        self._velocity = np.zeros(6) if velocity is None else velocity
         self._covariance = np.diag(np.concatenate([np.zeros(6), _UNKNOWN**2]))
         self._covariance[:6, :6] = seen
 
@@ -97,7 +101,8 @@ class Motion:
         surprise = float(off @ inverted @ off)
         self._unrest += _LEARNT * (min(surprise, _SURPRISE) / 6 - self._unrest)
         if surprise > _SURPRISE:
-            self._begin(T_cw, seen)
+            velocity = log_se3(T_cw @ inverse(self._T_cw)) / max(self._step, _SHORTEST)
+            self._begin(T_cw, seen, velocity if np.all(np.abs(velocity) < 3 * _UNKNOWN) else None)
             return
         gain = covariance[:, :6] @ inverted
         correction = gain @ off

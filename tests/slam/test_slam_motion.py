@@ -86,6 +86,16 @@ def test_a_leap_is_believed_and_the_velocity_is_then_unknown_again() -> None:
     np.testing.assert_allclose(unsure.T_cw, exp_se3(np.array([0.3, 0, 0, 0, 0, 0])) @ at(12 * STEP))
 
 
+def test_a_start_that_a_hand_can_make_gives_a_velocity_at_once() -> None:
+    motion = Motion()
+    for k in range(12):
+        motion.found(k * STEP, np.eye(4), SURE)
+    start = np.array([0.05, 0, 0, 0, 0, 0.04])
+    motion.found(12 * STEP, exp_se3(start), SURE)
+    assert motion.twist is not None
+    np.testing.assert_allclose(motion.twist, start / STEP, atol=0.02)
+
+
 def test_two_frames_of_one_stamp_leave_all_numbers_finite() -> None:
     motion = moved([k * STEP for k in range(12)])
     for leap in (0.0, 0.3):
