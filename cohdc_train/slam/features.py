@@ -87,7 +87,7 @@ class FeatureExtractor:
 
     def find(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Corners:
         """The corners alone; arguments as above."""
-        gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        gray = gray_of(rgb)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found, table = self._detect(gray, allowed)
         chosen = spread(table, self._quota)
@@ -151,6 +151,11 @@ class FeatureExtractor:
         order = np.lexsort((places[:, 0], places[:, 1], octaves))
         order = order[responses[order] >= _THRESHOLDS[k]]
         return [found[i] for i in order], np.column_stack([places, octaves, responses])[order]
+
+
+def gray_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """rgb: [H, W, 3] uint8 RGB. Returns [H, W] uint8."""
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

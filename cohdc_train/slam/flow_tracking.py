@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.features import Corners, Features
+from cohdc_train.slam.features import Corners, Features, gray_of
 from cohdc_train.slam.localization import Fit
-from cohdc_train.slam.map import Map, observations
+from cohdc_train.slam.map import Map
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.motion import Expectation
 from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
@@ -74,8 +74,7 @@ class FlowTracker:
         rows = fit.matches.corners
         corners = Corners(features.pixels[rows], features.octaves[rows], features.descriptors[rows])
         off = corners.pixels - self._seen_from(fit.T_cw, fit.matches.points)
-        masked = ~_free(corners.pixels, self.map.camera, mask)
-        self._start = _Start(_gray(rgb), corners, fit, off, masked)
+        self._start = _Start(gray_of(rgb), corners, fit, off, _covered(corners.pixels, mask))
 
     def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
         """Look for the points in the next frame; None when it is to be matched.
@@ -89,11 +88,11 @@ class FlowTracker:
         guess = (self._seen_from(T_cw, before.fit.matches.points) + before.off).astype(np.float32)
         starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            before.gray, _gray(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
+            before.gray, gray_of(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
         )
         pixels = np.asarray(found, dtype=np.float64)
-        free = _free(pixels, self.map.camera, mask) | (before.masked & _free(pixels, self.map.camera, None))
-        rows = np.flatnonzero((status[:, 0] > 0) & free)
+        rows = np.flatnonzero((status[:, 0] > 0) & _inside(pixels, self.map.camera))
+        rows = rows[before.masked[rows] | ~_covered(pixels[rows], mask)]
         corners = Corners(pixels[rows], before.corners.octaves[rows], before.corners.descriptors[rows])
         return Followed(before.fit.matches.points[rows], corners)
 
@@ -104,8 +103,7 @@ class FlowTracker:
         if len(features) < least:
             return None
         matches = Matches(followed.ids, np.arange(len(features)))
-        seen = observations(features, matches.corners, self.map.trust(matches.points))
-        points = self.map.positions[matches.points]
+        points, seen = self.map.measured(matches, features)
         prior = expected.given(len(features))
         T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < least:
@@ -121,15 +119,15 @@ class FlowTracker:
         return camera.distort(camera.project(local))
 
 
-def _gray(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-def _free(pixels: Array, camera: Camera, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """[m] bool: inside the image and not under the mask. pixels: [m, 2]."""
+def _inside(pixels: Array, camera: Camera) -> NDArray[np.bool_]:
+    """[m] bool, of pixels [m, 2]: in the image."""
     x, y = np.rint(pixels).T
-    inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    return np.asarray((x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
+
+
+def _covered(pixels: Array, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """[m] bool, of pixels [m, 2] in the image: under the mask."""
     if mask is None:
-        return np.asarray(inside)
-    columns, rows = np.where(inside, x, 0).astype(np.int64), np.where(inside, y, 0).astype(np.int64)
-    return np.asarray(inside & ~mask[rows, columns])
+        return np.zeros(len(pixels), dtype=np.bool_)
+    x, y = np.rint(pixels).astype(np.int64).T
+    return np.asarray(mask[y, x])

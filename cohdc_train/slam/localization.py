@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.features import Features
-from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.motion import Expectation
-from cohdc_train.slam.optimization import Array, Observations, Weighing, optimize_pose, pose_information
+from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information
 from cohdc_train.slam.ransac import ransac_pose
 from cohdc_train.slam.rigidity import pose_of_rest
 
@@ -77,7 +77,7 @@ class Localizer:
     def _solve(self, features: Features, matches: Matches, guess: Array | None, hypotheses: int) -> Fit | None:
         if len(matches) < _MIN_FIRST:
             return None
-        points, seen = self._seen(features, matches)
+        points, seen = self.map.measured(matches, features)
         found = ransac_pose(points, seen, self.map.camera, self._rng, hypotheses, guess=guess)
         if found is None or found[1].sum() < _MIN_FIRST:
             return None
@@ -93,7 +93,7 @@ class Localizer:
         keyframes = self.map.covisible(rough.matches.points, LOCAL_KEYFRAMES)
         projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
         matches = match_projected(projected, features, radius=5.0)
-        points, seen = self._seen(features, matches)
+        points, seen = self.map.measured(matches, features)
         prior = None if expected is None else expected.given(len(matches))
         moving = np.zeros(len(matches), dtype=np.bool_)
         if self._judges:
@@ -109,11 +109,6 @@ class Localizer:
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
         return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], information, prior is not None)
-
-    def _seen(self, features: Features, matches: Matches) -> tuple[Array, Observations]:
-        """Where the map has the matched points, [m, 3] m, and what the frame measured of them."""
-        seen = observations(features, matches.corners, self.map.trust(matches.points))
-        return self.map.positions[matches.points], seen
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -161,6 +161,11 @@ class Map:
         """[n] probability that each point stands still, as a share of a new point's: its weight, above 0 up to 1."""
         return np.asarray((1 + np.exp(-_STILL)) / (1 + np.exp(self.moved[ids] - _STILL)))
 
+    def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
+        """Where the map has the matched points, [m, 3] m, and what a frame measured of them."""
+        seen = observations(features, matches.corners, self.trust(matches.points))
+        return self.positions[matches.points], seen
+
     def judge(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
         """A frame has seen points stand still, and others move with a group that does not."""
         self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)

@@ -65,9 +65,7 @@ class Motion:
 
         After a pause it is held to have gone on for as long as its velocity is known to say something.
         """
-        information = np.asarray(np.linalg.inv(self._predicted(t)[:6, :6]), dtype=np.float64)
-        T_cw = exp_se3(self._ahead(t) * self._velocity) @ self._T_cw
-        return Expectation(Prior(T_cw, information), self._unrest < 1)
+        return Expectation(self._prior(t, self._predicted(t)), self._unrest < 1)
 
     def found(self, t: float, T_cw: Array, information: Array, weighed: bool = False) -> None:
         """The frame at t is at T_cw. information: [6, 6] of what it saw; weighed: T_cw is a compromise of that with
@@ -91,7 +89,8 @@ class Motion:
 
     def _update(self, t: float, T_cw: Array, seen: Array, weighed: bool) -> None:
         assert self._t is not None
-        expected, covariance = self.expected(t).prior, self._predicted(t)
+        covariance = self._predicted(t)
+        expected = self._prior(t, covariance)
         self._step = t - self._t
         off = log_se3(T_cw @ inverse(expected.T_cw))
         spread = covariance[:6, :6] + seen
@@ -109,6 +108,11 @@ class Motion:
         self._T_cw = exp_se3(correction[:6]) @ expected.T_cw
         self._velocity = self._velocity + correction[6:]
         self._covariance = covariance - gain @ spread @ gain.T
+
+    def _prior(self, t: float, predicted: Array) -> Prior:
+        """The pose at t and how surely, of the covariance [12, 12] predicted for then."""
+        information = np.asarray(np.linalg.inv(predicted[:6, :6]), dtype=np.float64)
+        return Prior(exp_se3(self._ahead(t) * self._velocity) @ self._T_cw, information)
 
     def _ahead(self, t: float) -> float:
         """s for which the velocity is held."""

@@ -4,7 +4,6 @@ import time
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +11,7 @@ from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import dynamic_mask_of
-from cohdc_train.slam.features import Corners, FeatureExtractor, Features
+from cohdc_train.slam.features import Corners, FeatureExtractor, Features, gray_of
 from cohdc_train.slam.flow_tracking import FlowTracker
 from cohdc_train.slam.geometry import Geometry
 from cohdc_train.slam.keyframe_culling import cull_keyframes
@@ -22,7 +21,7 @@ from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.mapping import insert_keyframe
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.motion import Motion
+from cohdc_train.slam.motion import Expectation, Motion
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse
 from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.shutter import unrolled
@@ -106,20 +105,21 @@ class Tracker:
         start = time.perf_counter()
         self._take_in_mapping()
         late = None if depth_t is None else depth_t - t
-        fit = self._by_flow(rgb, depth_m, t, mask, late)
+        expected = None if self._last is None else self._motion.expected(t)
+        fit = None if expected is None else self._by_flow(rgb, depth_m, expected, mask, late)
         if fit is not None:
             tracked = time.perf_counter()
             self._motion.found(t, fit.T_cw, fit.information, fit.weighed)
             self._remember(fit, t, False)
             return _pose_of(fit, t, False, start, tracked)
-        given, mask = mask, self._dynamic(mask, depth_m, t)
+        given, mask = mask, self._dynamic(mask, depth_m, expected, t)
         self.mask = mask
         features = self._corners(rgb, depth_m, mask, late)
-        fit = self._locate(features, rgb, t)
+        fit = self._locate(features, rgb, expected)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
             features = self._corners(rgb, depth_m, None, late)
-            fit = self._locate(features, rgb, t)
+            fit = self._locate(features, rgb, expected)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
@@ -164,14 +164,13 @@ class Tracker:
         self,
         rgb: NDArray[np.uint8],
         depth_m: NDArray[np.float32],
-        t: float,
+        expected: Expectation,
         mask: NDArray[np.bool_] | None,
         late: float | None,
     ) -> Fit | None:
         """The pose by what the last matched frame saw; None where this one is to be matched."""
-        if self._flow is None or self._last is None:
+        if self._flow is None:
             return None
-        expected = self._motion.expected(t)
         followed = self._flow.follow(rgb, mask, expected.prior.T_cw)
         if followed is None:
             return None
@@ -183,13 +182,17 @@ class Tracker:
         return fit
 
     def _dynamic(
-        self, mask: NDArray[np.bool_] | None, depth_m: NDArray[np.float32], t: float
+        self,
+        mask: NDArray[np.bool_] | None,
+        depth_m: NDArray[np.float32],
+        expected: Expectation | None,
+        t: float,
     ) -> NDArray[np.bool_] | None:
         """The mask after depth had its say, where the camera is expected."""
-        if not self.method.geometry or self._last is None:
+        if not self.method.geometry or self._last is None or expected is None:
             return mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return dynamic_mask_of(self._geometry, mask, depth_m, self._motion.expected(t).prior.T_cw, around, t)
+        return dynamic_mask_of(self._geometry, mask, depth_m, expected.prior.T_cw, around, t)
 
     def _corners(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
@@ -205,15 +208,15 @@ class Tracker:
         features = self._extract.measure(corners, depth_m, mask, lag)
         return features if twist is None else unrolled(features, self.camera, twist)
 
-    def _locate(self, features: Features, rgb: NDArray[np.uint8], t: float) -> Fit | None:
+    def _locate(self, features: Features, rgb: NDArray[np.uint8], expected: Expectation | None) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
             where_the_world_begins = Fit(np.eye(4), Matches(empty, empty), information=_CERTAIN * np.eye(6))
             return where_the_world_begins if usable >= MIN_START else None
-        if self._last is None:
+        if self._last is None or expected is None:
             return self._localizer.anywhere(features, rgb)
-        return self._localizer.near(features, rgb, self._last, self._motion.expected(t))
+        return self._localizer.near(features, rgb, self._last, expected)
 
     def _take_in_mapping(self) -> None:
         """What was mapped beside tracking, if anything, goes into the map; the last pose moves along."""
@@ -235,7 +238,7 @@ class Tracker:
     def _add_keyframe(
         self, features: Features, fit: Fit, t: float, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
     ) -> Fit:
-        pyramid = Pyramid(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)) if self._refiner else None
+        pyramid = Pyramid(gray_of(rgb)) if self._refiner else None
         if self._refiner is not None and pyramid is not None:
             features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
         point_ids = np.full(len(features), -1)
