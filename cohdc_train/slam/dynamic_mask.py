@@ -7,31 +7,44 @@ from cohdc_train.slam.culling import Mask, grow
 from cohdc_train.slam.geometry import Geometry, Reference
 from cohdc_train.slam.map import Keyframe
 from cohdc_train.slam.optimization import Array
+from cohdc_train.slam.surfaces import Movers
 
 _REFERENCES = 8  # keyframes whose depth a frame is held against
 _BAND = 8.0  # px: a coarse pixel's width, around what depth finds
-_RESTED = 2.0  # s that a masked thing must have stood still to be of use to tracking
+_RESTED = 2.0  # s that a masked or moving thing must have stood still to be of use to tracking
 
 
-def dynamic_mask_of(
-    geometry: Geometry, mask: Mask | None, depth: NDArray[np.float32], T_cw: Array, around: list[Keyframe], t: float
-) -> Mask | None:
-    """mask, depth: [H, W], depth in m; T_cw: the frame's expected pose; around: keyframes that see the same place.
+class DynamicMask:
+    """Makes the masks of one frame after the other."""
 
-    Returns [H, W] bool, True = dynamic; None where nothing was given and nothing moves.
-    """
-    around = sorted(around, key=lambda keyframe: keyframe.index)
-    judges = _spread(around)
-    older = [] if mask is None else _spread([k for k in around if k.t <= t - _RESTED])
-    all_of_them = list({k.index: k for k in (*judges, *older)}.values())
-    row = {k.index: i for i, k in enumerate(all_of_them)}
-    comparison = geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
-    moves = grow(geometry.movers(comparison.only([row[k.index] for k in judges])), _BAND)
-    if mask is None:
-        return moves if moves.any() else None
-    if older:
-        mask = mask & ~geometry.at_rest(mask, comparison.only([row[k.index] for k in older]))
-    return mask | moves
+    def __init__(self, geometry: Geometry) -> None:
+        self._geometry = geometry
+        self._movers = Movers()
+
+    def forget(self) -> None:
+        """The place is lost."""
+        self._movers.forget()
+
+    def of(
+        self, mask: Mask | None, depth: NDArray[np.float32], T_cw: Array, around: list[Keyframe], t: float
+    ) -> Mask | None:
+        """mask, depth: [H, W], depth in m; T_cw: the frame's expected pose; around: keyframes that see the same place.
+
+        Returns [H, W] bool, True = dynamic; None where nothing was given and nothing moves.
+        """
+        around = sorted(around, key=lambda keyframe: keyframe.index)
+        judges, older = _spread(around), _spread([k for k in around if k.t <= t - _RESTED])
+        all_of_them = list({k.index: k for k in (*judges, *older)}.values())
+        row = {k.index: i for i, k in enumerate(all_of_them)}
+        comparison = self._geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
+        found = self._geometry.movers(comparison.only([row[k.index] for k in judges]))
+        long_ago = comparison.only([row[k.index] for k in older])
+        moves = grow(self._geometry.fine(self._movers.whole(found, long_ago.still, comparison.image)), _BAND)
+        if mask is None:
+            return moves if moves.any() else None
+        if older:
+            mask = mask & ~self._geometry.at_rest(mask, long_ago)
+        return mask | moves
 
 
 def _spread(keyframes: list[Keyframe]) -> list[Keyframe]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.optimization import Array, inverse
+from cohdc_train.slam.surfaces import JUMP, LEAST
 
 _STEP = 8  # px of the image per coarse pixel
 _CENTRE = (_STEP - 1) / 2
@@ -21,10 +22,8 @@ _NEARER, _NEARER_PER_M = 0.1, 0.03  # m, and m per m of depth: nearer by less is
 _NEAR = 0.2  # m: the sensor sees nothing nearer
 _FAR = 5.0  # m: nor anything reliable further off
 _VOTES = 2  # keyframes that must have looked through the place
-_LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
-_GROWTH, _SAME = 3, 0.12  # coarse px a mover grows over its own surface, and m its depth may change per px
+_GROWTH = 3  # coarse px a mover grows over its own surface
 _JUDGED, _MOVED = 0.6, 0.05  # of a part at rest: readings that agree, at least, and that do not, at most
-_MOST = 0.8  # of the readings: so many movers mean that the pose is wrong
 
 Coarse = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -98,13 +97,16 @@ class Geometry:
         return Comparison(image, through.reshape(shape), agrees.reshape(shape))
 
     def movers(self, comparison: Comparison) -> NDArray[np.bool_]:
-        """Returns [H, W] bool, True = moves."""
+        """Returns [h, w] bool, coarse: what two references looked through, and its surface around it."""
         image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
-        found = _whole(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
-        if not found.any() or np.count_nonzero(found) > _MOST * np.count_nonzero(image):
+        return _grown(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
+
+    def fine(self, movers: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """movers: [h, w] bool, coarse. Returns [H, W] bool, the same in the image as measured."""
+        if not movers.any():
             return np.zeros((self.camera.height, self.camera.width), dtype=np.bool_)
         size = (_STEP * self._shape[1], _STEP * self._shape[0])
-        smooth = cv2.resize(found.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        smooth = cv2.resize(movers.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(cv2.remap(smooth, self._flat, np.empty(0), cv2.INTER_NEAREST) > 127)
 
     def at_rest(self, mask: NDArray[np.bool_], comparison: Comparison) -> NDArray[np.bool_]:
@@ -118,7 +120,7 @@ class Geometry:
             np.bincount(coarse[chosen], minlength=count)
             for chosen in (comparison.image > 0, comparison.still, comparison.through.any(axis=0))
         )
-        rests = (still >= np.maximum(_JUDGED * readings, _LEAST)) & (moved <= _MOVED * still)
+        rests = (still >= np.maximum(_JUDGED * readings, LEAST)) & (moved <= _MOVED * still)
         rests[0] = False
         return np.asarray(rests[parts]) if rests.any() else np.zeros_like(mask)
 
@@ -166,13 +168,13 @@ def _maps(places: Array, shape: tuple[int, int]) -> tuple[NDArray[np.float32], N
     return x.reshape(shape), y.reshape(shape)
 
 
-def _whole(found: NDArray[np.bool_], still: NDArray[np.bool_], image: Coarse) -> NDArray[np.bool_]:
+def _grown(found: NDArray[np.bool_], still: NDArray[np.bool_], image: Coarse) -> NDArray[np.bool_]:
     """Specks dropped; the rest grown over its own surface, as far as that is not known to stand still."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
-    big = stats[:, cv2.CC_STAT_AREA] >= _LEAST
+    big = stats[:, cv2.CC_STAT_AREA] >= LEAST
     big[0] = False
     kept = big[labels]
     for _ in range(_GROWTH):
         beside = cv2.dilate(np.where(kept, image, 0.0).astype(np.float32), _CROSS)  # depth of the mover next to it
-        kept |= (beside > 0) & (image > 0) & ~still & (np.abs(beside - image) < _SAME)
+        kept |= (beside > 0) & (image > 0) & ~still & (np.abs(beside - image) < JUMP)
     return np.asarray(cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, _CROSS) > 0)

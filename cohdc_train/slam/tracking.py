@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.dynamic_mask import dynamic_mask_of
+from cohdc_train.slam.dynamic_mask import DynamicMask
 from cohdc_train.slam.features import Corners, FeatureExtractor, Features, gray_of
 from cohdc_train.slam.flow_tracking import FlowTracker
 from cohdc_train.slam.geometry import Geometry
@@ -75,6 +75,7 @@ class Tracker:
         self.mask: NDArray[np.bool_] | None = None  # as given; a matched frame's less what is at rest, and what moves
         self._extract = FeatureExtractor(camera, features)
         self._geometry = Geometry(camera)
+        self._dynamic_mask = DynamicMask(self._geometry)
         self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
@@ -192,7 +193,7 @@ class Tracker:
         if not self.method.geometry or self._last is None or expected is None:
             return mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return dynamic_mask_of(self._geometry, mask, depth_m, expected.prior.T_cw, around, t)
+        return self._dynamic_mask.of(mask, depth_m, expected.prior.T_cw, around, t)
 
     def _corners(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
@@ -268,6 +269,7 @@ class Tracker:
         if fit is None or fit.reference is None:
             self._last = None
             self._motion.forget()
+            self._dynamic_mask.forget()
             return
         self._last = fit
         if self._since_keyframe > 0 and matched:

@@ -23,6 +23,8 @@ IMAGES_PER_ROOM = 5
 PEOPLE_PER_ROOM = 3
 SMALLEST_SHARE = 1 / 200  # of the image's pixels; a smaller visible part of a person is annotated as a crowd: ignored
 SUPERSAMPLING = 1.5
+NEAREST = 0.35  # m from the camera to the middle of a person, whom it would otherwise stand in
+DISTANCE = (0.7, 3.7)  # m, of people from the camera
 _COUNT_CHANCE = (0.08, 0.42, 0.34, 0.16)  # of 0, 1, .. 3 people
 
 
@@ -52,13 +54,15 @@ def draw_stage(rng: np.random.Generator, detail: int) -> Stage:
     return Stage(room, people, atlas)
 
 
-def take_picture(stage: Stage, rng: np.random.Generator, size: tuple[int, int]) -> Picture:
-    """One picture by a hand-held camera somewhere in the room. size: (height, width), px."""
+def take_picture(
+    stage: Stage, rng: np.random.Generator, size: tuple[int, int], distance: tuple[float, float] = DISTANCE
+) -> Picture:
+    """One picture by a hand-held camera somewhere in the room. size: (height, width), px; distance: of people, m."""
     camera = Camera.freiburg3(size).resized(SUPERSAMPLING)
     T_wc = _camera_pose(stage.room, rng)
     room = stage.room
     meshes = [room.mesh]
-    for k, place in enumerate(_places(room, rng, T_wc)):
+    for k, place in enumerate(_places(room, rng, T_wc, distance)):
         person = stage.people[k]
         body = bodies.person_mesh(person, bodies.draw_pose(rng), place, float(rng.uniform(0, 2 * np.pi)))
         meshes.append(body.named(k + 1, len(room.textures) + 6 * k))
@@ -84,15 +88,18 @@ def _camera_pose(room: Room, rng: np.random.Generator) -> NDArray[np.float64]:
     return pose
 
 
-def _places(room: Room, rng: np.random.Generator, T_wc: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """Free spots in front of the camera for 0-3 people, 0.7-3.7 m away, the outermost cut by the image's border."""
+def _places(
+    room: Room, rng: np.random.Generator, T_wc: NDArray[np.float64], distances: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Free spots in front of the camera for 0-3 people, the outermost cut by the image's border."""
     wanted = int(rng.choice(len(_COUNT_CHANCE), p=_COUNT_CHANCE))
     forward = np.arctan2(T_wc[1, 2], T_wc[0, 2])
+    nearest, farthest = distances
     found: list[tuple[float, float]] = []
     for _ in range(40 * wanted):
         if len(found) == wanted:
             break
-        distance, angle = 0.7 + 3.0 * rng.beta(1.3, 1.6), forward + rng.uniform(-0.6, 0.6)
+        distance, angle = nearest + (farthest - nearest) * rng.beta(1.3, 1.6), forward + rng.uniform(-0.6, 0.6)
         x, y = float(T_wc[0, 3] + distance * np.cos(angle)), float(T_wc[1, 3] + distance * np.sin(angle))
         apart = all(np.hypot(x - a, y - b) > 0.5 for a, b in found)
         if apart and room.is_free(x, y, 0.25):
@@ -130,7 +137,14 @@ def _visible(instance: NDArray[np.int32], size: tuple[int, int]) -> NDArray[np.b
     return np.stack(masks) if masks else np.zeros((0, *size), dtype=np.bool_)
 
 
-def coco(out: Path, train: int = 500, val: int = 60, size: tuple[int, int] = (192, 256), seed: int = 0) -> None:
+def coco(
+    out: Path,
+    train: int = 500,
+    val: int = 60,
+    size: tuple[int, int] = (192, 256),
+    seed: int = 0,
+    distance: tuple[float, float] = DISTANCE,
+) -> None:
     """Render a COCO-format folder of people in rooms: images/, instances_train.json, instances_val.json.
 
     No room, garment or body of one split occurs in the other or in a sequence.
@@ -141,19 +155,20 @@ def coco(out: Path, train: int = 500, val: int = 60, size: tuple[int, int] = (19
         val: number of validation images.
         size: height and width of the images, px; at least 48 each.
         seed: same seed, same bytes.
+        distance: nearest and farthest that people stand from the camera, m; below 0.6 one may fill the picture.
     """
-    _check(train, val, size, seed)
+    _check(train, val, size, seed, distance)
     with new_folder(out) as draft:
         (draft / "images").mkdir()
         counts = {}
         for split, number in (("train", train), ("val", val)):
-            document = _render_split(draft, split, number, size, seed)
+            document = _render_split(draft, split, number, size, seed, distance)
             (draft / f"instances_{split}.json").write_text(json.dumps(document))
             counts[split] = len(document["annotations"])
     print(f"{out}: {train} + {val} images with {counts['train']} + {counts['val']} people")
 
 
-def _check(train: int, val: int, size: tuple[int, int], seed: int) -> None:
+def _check(train: int, val: int, size: tuple[int, int], seed: int, distance: tuple[float, float]) -> None:
     for name, number in (("train", train), ("val", val)):
         if number < 1:
             raise DataError(f"{name}: {number} images; a split has at least 1")
@@ -161,9 +176,13 @@ def _check(train: int, val: int, size: tuple[int, int], seed: int) -> None:
         raise DataError(f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48")
     if seed < 0:
         raise DataError(f"seed: {seed} is negative")
+    if not NEAREST <= distance[0] <= distance[1]:
+        raise DataError(f"distance: {distance[0]} to {distance[1]} m; needs {NEAREST} <= nearest <= farthest")
 
 
-def _render_split(folder: Path, split: str, number: int, size: tuple[int, int], seed: int) -> dict[str, Any]:
+def _render_split(
+    folder: Path, split: str, number: int, size: tuple[int, int], seed: int, distance: tuple[float, float]
+) -> dict[str, Any]:
     """Write one split's images; returns its COCO document."""
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -171,7 +190,7 @@ def _render_split(folder: Path, split: str, number: int, size: tuple[int, int], 
         rng = stream(seed, f"coco-{split}", first // IMAGES_PER_ROOM)
         stage = draw_stage(rng, texture_detail(size))
         for image_id in range(first + 1, min(first + IMAGES_PER_ROOM, number) + 1):
-            picture = take_picture(stage, rng, size)
+            picture = take_picture(stage, rng, size, distance)
             name = f"{split}_{image_id:06d}.jpg"
             _write_jpeg(folder / "images" / name, picture.image)
             images.append({"id": image_id, "file_name": name, "height": size[0], "width": size[1]})

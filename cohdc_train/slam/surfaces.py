@@ -1,0 +1,63 @@
+"""Things move as a whole: what depth finds moving on a part of a surface moves on all of it, and goes on moving.
+
+A surface is a connected part of a depth image without jumps. Who comes up to the camera is found by depth where some
+keyframe has looked through the place; soon most of him is where none has looked, being too near. He moves until he has
+been seen at rest.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+JUMP = 0.12  # m of depth from one coarse pixel to the next, from which on they belong to two surfaces
+LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
+_FOUND = 0.4  # share of a surface that must be found moving for all of it to move
+_AGAIN = 0.5  # share of it that must have moved in the frame before
+_STILL = 0.1  # share of it, at most, that has long been known to stand there
+_MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
+
+Bits = NDArray[np.bool_]  # [h, w], coarse
+
+
+class Movers:
+    """Remembers what moved in the latest frame."""
+
+    def __init__(self) -> None:
+        self._latest: Bits | None = None
+
+    def forget(self) -> None:
+        """The camera may be elsewhere."""
+        self._latest = None
+
+    def whole(self, found: Bits, still: Bits, image: NDArray[np.float32]) -> Bits:
+        """What moves: the parts found to, and all of every surface of which enough is found, or moved just now.
+
+        found: [h, w] bool, seen to move; still: [h, w] bool, long known to stand there; image: [h, w] m, 0 = unknown.
+        """
+        known = image > 0
+        labels = surfaces(image)
+        count = int(labels.max(initial=0)) + 1
+        before = np.zeros_like(found) if self._latest is None else self._latest
+        size, hit, again, rest = (
+            np.bincount(labels[chosen & known], minlength=count) for chosen in (known, found, before, still)
+        )
+        moves = (hit >= _FOUND * size) | (again >= _AGAIN * size)
+        moves &= (rest <= _STILL * size) & (size >= LEAST)
+        moves[0] = False
+        movers = np.asarray(found | moves[labels])
+        if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
+            movers = np.zeros_like(found)
+        self._latest = movers
+        return movers
+
+
+def surfaces(image: NDArray[np.float32]) -> NDArray[np.int32]:
+    """image: [h, w] m, 0 = unknown. Returns [h, w] int32: the number of every pixel's surface from 1 on; 0 = unknown."""
+    h, w = image.shape
+    known = image > 0
+    nodes = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)  # pixels, and between them what joins them
+    nodes[::2, ::2] = known
+    nodes[::2, 1::2] = known[:, 1:] & known[:, :-1] & (np.abs(image[:, 1:] - image[:, :-1]) < JUMP)
+    nodes[1::2, ::2] = known[1:] & known[:-1] & (np.abs(image[1:] - image[:-1]) < JUMP)
+    _, labels = cv2.connectedComponents(nodes, connectivity=4)
+    return np.ascontiguousarray(labels[::2, ::2], dtype=np.int32)
