@@ -11,6 +11,7 @@ from cohdc_train.slam.surfaces import Movers
 
 _REFERENCES = 8  # keyframes whose depth a frame is held against
 _BAND = 8.0  # px: a coarse pixel's width, around what depth finds
+_STOOD = 0.5
 _RESTED = 2.0  # s that a masked or moving thing must have stood still to be of use to tracking
 
 
@@ -39,7 +40,9 @@ class DynamicMask:
         comparison = self._geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
         found = self._geometry.movers(comparison.only([row[k.index] for k in judges]))
         long_ago = comparison.only([row[k.index] for k in older])
-        moves = grow(self._geometry.fine(self._movers.whole(found, long_ago.still, comparison.image)), _BAND)
+        a_while_ago = [row[k.index] for k in all_of_them if k.t <= t - _STOOD]
+        stood = comparison.only(a_while_ago).still if a_while_ago else None
+        moves = grow(self._geometry.fine(self._movers.whole(found, stood, long_ago.still, comparison.image)), _BAND)
         if mask is None:
             return moves if moves.any() else None
         if older:

@@ -23,31 +23,37 @@ class Movers:
     """Remembers what moved in the latest frame."""
 
     def __init__(self) -> None:
-        self._latest: Bits | None = None
+        self._latest: NDArray[np.float32] | None = None  # [h, w] m, depth of what moved, 0 elsewhere
 
     def forget(self) -> None:
         """The camera may be elsewhere."""
         self._latest = None
 
-    def whole(self, found: Bits, still: Bits, image: NDArray[np.float32]) -> Bits:
+    def whole(self, found: Bits, stood: Bits | None, rested: Bits, image: NDArray[np.float32]) -> Bits:
         """What moves: the parts found to, and all of every surface of which enough is found, or moved just now.
 
-        found: [h, w] bool, seen to move; still: [h, w] bool, long known to stand there; image: [h, w] m, 0 = unknown.
+        found: [h, w] bool, seen to move; stood, rested: [h, w] bool, known for a moment and for long to stand there,
+        None where nothing is known; image: [h, w] m, 0 = unknown.
         """
         known = image > 0
         labels = surfaces(image)
         count = int(labels.max(initial=0)) + 1
-        before = np.zeros_like(found) if self._latest is None else self._latest
-        size, hit, again, rest = (
-            np.bincount(labels[chosen & known], minlength=count) for chosen in (known, found, before, still)
+        before = np.zeros_like(found)
+        if self._latest is not None:
+            before = (self._latest > 0) & (np.abs(self._latest - image) < JUMP)
+        size, hit, again, short, rest = (
+            np.bincount(labels[chosen & known], minlength=count)
+            for chosen in (known, found, before, known if stood is None else stood, rested)
         )
-        moves = (hit >= _FOUND * size) | (again >= _AGAIN * size)
-        moves &= (rest <= _STILL * size) & (size >= LEAST)
-        moves[0] = False
-        movers = np.asarray(found | moves[labels])
+        moves = (hit >= _FOUND * size) & (short <= _STILL * size) & (size >= LEAST)
+        goes_on = (again >= _AGAIN * size) & (rest <= _STILL * size) & (size >= LEAST)
+        moves[0] = goes_on[0] = False
+        movers = found | moves[labels]
+        if stood is not None:
+            movers |= goes_on[labels] & (before | ~stood)
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
-        self._latest = movers
+        self._latest = np.where(movers, image, np.float32(0))
         return movers
 
 
