@@ -13,7 +13,7 @@ JUMP = 0.12  # m of depth from one coarse pixel to the next, from which on they 
 LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
 _FOUND = 0.4  # share of a surface that must be found moving for all of it to move
 _AGAIN = 0.5  # share of it that must have moved in the frame before
-_STILL = 0.1  # share of it, at most, that has long been known to stand there
+_STILL = 0.3  # share of it, at most, that has long been known to stand there
 _MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
 
 Bits = NDArray[np.bool_]  # [h, w], coarse
