@@ -11,7 +11,7 @@ from cohdc_train.slam.surfaces import Movers
 
 _REFERENCES = 8  # keyframes whose depth a frame is held against
 _BAND = 8.0  # px: a coarse pixel's width, around what depth finds
-_STOOD = 0.5
+_STOOD = 0.5  # s for which a surface must have stood still not to be taken for a part of what moves
 _RESTED = 2.0  # s that a masked or moving thing must have stood still to be of use to tracking
 
 
@@ -38,11 +38,12 @@ class DynamicMask:
         all_of_them = list({k.index: k for k in (*judges, *older)}.values())
         row = {k.index: i for i, k in enumerate(all_of_them)}
         comparison = self._geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
-        found = self._geometry.movers(comparison.only([row[k.index] for k in judges]))
+        before = [row[k.index] for k in all_of_them if k.t <= t - _STOOD]
+        stood = comparison.only(before).still if before else np.ones(comparison.image.shape, dtype=np.bool_)
         long_ago = comparison.only([row[k.index] for k in older])
-        a_while_ago = [row[k.index] for k in all_of_them if k.t <= t - _STOOD]
-        stood = comparison.only(a_while_ago).still if a_while_ago else None
-        moves = grow(self._geometry.fine(self._movers.whole(found, stood, long_ago.still, comparison.image)), _BAND)
+        found = self._geometry.movers(comparison.only([row[k.index] for k in judges]))
+        found = self._movers.whole(found, stood, long_ago.still, comparison.image)
+        moves = grow(self._geometry.fine(found), _BAND)
         if mask is None:
             return moves if moves.any() else None
         if older:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 JUMP = 0.12  # m of depth from one coarse pixel to the next, from which on they belong to two surfaces
 LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
 _FOUND = 0.4  # share of a surface that must be found moving for all of it to move
-_AGAIN = 0.5  # share of it that must have moved in the frame before
-_STILL = 0.3  # share of it, at most, that has long been known to stand there
+_AGAIN = 0.5  # share of it that must have moved in the frame before, to go on
+_STILL = 0.3  # share of it, at most, that is known to have stood there
 _MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
 
 Bits = NDArray[np.bool_]  # [h, w], coarse
@@ -29,28 +29,23 @@ class Movers:
         """The camera may be elsewhere."""
         self._latest = None
 
-    def whole(self, found: Bits, stood: Bits | None, rested: Bits, image: NDArray[np.float32]) -> Bits:
+    def whole(self, found: Bits, stood: Bits, rested: Bits, image: NDArray[np.float32]) -> Bits:
         """What moves: the parts found to, and all of every surface of which enough is found, or moved just now.
 
-        found: [h, w] bool, seen to move; stood, rested: [h, w] bool, known for a moment and for long to stand there,
-        None where nothing is known; image: [h, w] m, 0 = unknown.
+        found: [h, w] bool, seen to move; stood, rested: [h, w] bool, known to have stood there a moment ago and long
+        ago; image: [h, w] m, 0 = unknown.
         """
-        known = image > 0
-        labels = surfaces(image)
-        count = int(labels.max(initial=0)) + 1
-        before = np.zeros_like(found)
+        known, before = image > 0, np.zeros_like(found)
         if self._latest is not None:
             before = (self._latest > 0) & (np.abs(self._latest - image) < JUMP)
-        size, hit, again, short, rest = (
-            np.bincount(labels[chosen & known], minlength=count)
-            for chosen in (known, found, before, known if stood is None else stood, rested)
+        labels = surfaces(image)
+        count = int(labels.max(initial=0)) + 1
+        size, hit, again, short, long = (
+            np.bincount(labels[chosen & known], minlength=count) for chosen in (known, found, before, stood, rested)
         )
-        moves = (hit >= _FOUND * size) & (short <= _STILL * size) & (size >= LEAST)
-        goes_on = (again >= _AGAIN * size) & (rest <= _STILL * size) & (size >= LEAST)
-        moves[0] = goes_on[0] = False
-        movers = found | moves[labels]
-        if stood is not None:
-            movers |= goes_on[labels] & (before | ~stood)
+        starts = (hit >= _FOUND * size) & (short <= _STILL * size) & (size >= LEAST)
+        goes_on = (again >= _AGAIN * size) & (long <= _STILL * size) & (size >= LEAST)
+        movers = np.asarray(found | known & (starts[labels] | goes_on[labels] & (before | ~stood)))
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
         self._latest = np.where(movers, image, np.float32(0))
@@ -58,7 +53,7 @@ class Movers:
 
 
 def surfaces(image: NDArray[np.float32]) -> NDArray[np.int32]:
-    """image: [h, w] m, 0 = unknown. Returns [h, w] int32: the number of every pixel's surface from 1 on; 0 = unknown."""
+    """image: [h, w] m, 0 = unknown. Returns [h, w] int32: the number of every pixel's surface, 0 where unknown."""
     h, w = image.shape
     known = image > 0
     nodes = np.zeros((2 * h - 1, 2 * w - 1), dtype=np.uint8)  # pixels, and between them what joins them

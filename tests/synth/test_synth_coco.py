@@ -92,6 +92,16 @@ def test_same_seed_same_bytes_and_another_seed_differs(tmp_path: Path) -> None:
     assert all(first[name] != other[name] for name in first)
 
 
+def test_people_who_are_near_fill_more_of_the_picture(folder: Path, tmp_path: Path) -> None:
+    """The same rooms and people, at .45 to 1.3 m instead of .7 to 3.7 m."""
+    coco(tmp_path / "near", train=10, val=1, size=SIZE, seed=5, distance=(0.45, 1.3))
+    shares = []
+    for root in (folder, tmp_path / "near"):
+        annotations = json.loads((root / "instances_train.json").read_text())["annotations"]
+        shares.append(sum(annotation["area"] for annotation in annotations) / (10 * SIZE[0] * SIZE[1]))
+    assert shares[1] > 1.5 * shares[0], shares
+
+
 def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
     keys = [("coco-train", 0), ("coco-train", 1), ("coco-val", 0), ("coco-val", 1), ("sequence", 0)]
     stages = [draw_stage(stream(0, *key), 128) for key in keys]
@@ -113,6 +123,8 @@ def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
         ({"val": -1}, "val: -1 images"),
         ({"size": (20, 256)}, "size: 20 x 256 px"),
         ({"seed": -3}, "seed: -3"),
+        ({"distance": (0.2, 3.0)}, "distance: 0.2 to 3.0 m"),
+        ({"distance": (2.0, 1.0)}, "distance: 2.0 to 1.0 m"),
     ],
 )
 def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object], message: str) -> None:

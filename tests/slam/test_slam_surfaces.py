@@ -1,0 +1,131 @@
+"""Movers as whole surfaces that go on moving: known answers on coarse images, and who comes up to the camera."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from cohdc_train.slam.surfaces import JUMP, Bits, Movers, surfaces
+from cohdc_train.slam.tracking import Tracker
+from cohdc_train.trajectory import Trajectory, score
+
+SHAPE = (30, 40)
+NOWHERE = np.zeros(SHAPE, dtype=np.bool_)
+EVERYWHERE = ~NOWHERE
+
+
+def block(rows: slice, columns: slice) -> Bits:
+    bits = NOWHERE.copy()
+    bits[rows, columns] = True
+    return bits
+
+
+PERSON = block(slice(10, 25), slice(10, 20))
+HALF, THIRD = block(slice(10, 18), slice(10, 20)), block(slice(10, 15), slice(10, 20))
+
+
+def scene(person: Bits = PERSON, depth: float = 1.0) -> NDArray[np.float32]:
+    """Somebody before a wall 3 m away."""
+    return np.where(person, depth, 3.0).astype(np.float32)
+
+
+def test_of_a_surface_that_is_found_by_half_all_moves_and_nothing_else() -> None:
+    np.testing.assert_array_equal(Movers().whole(HALF, NOWHERE, NOWHERE, scene()), PERSON)
+
+
+def test_of_one_that_is_found_by_less_or_was_just_seen_there_only_that_moves() -> None:
+    np.testing.assert_array_equal(Movers().whole(THIRD, NOWHERE, NOWHERE, scene()), THIRD)
+    np.testing.assert_array_equal(Movers().whole(HALF, HALF, NOWHERE, scene()), HALF)
+
+
+def test_what_moved_goes_on_though_nothing_finds_it_until_it_was_seen_at_rest() -> None:
+    movers = Movers()
+    movers.whole(HALF, NOWHERE, NOWHERE, scene())
+    for step in range(1, 6):
+        image = scene(np.roll(PERSON, step, axis=1), 1.0 - 0.1 * step)
+        moved = movers.whole(NOWHERE, EVERYWHERE & (image > 2), NOWHERE, image)
+        np.testing.assert_array_equal(moved, image < 2)
+    there = image < 2
+    np.testing.assert_array_equal(movers.whole(NOWHERE, EVERYWHERE, NOWHERE, image), there)
+    assert not movers.whole(NOWHERE, EVERYWHERE, EVERYWHERE, image).any()
+
+
+def test_who_comes_after_in_the_same_place_does_not_move_for_it() -> None:
+    movers = Movers()
+    movers.whole(PERSON, NOWHERE, NOWHERE, scene())
+    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(depth=1.0 + 2 * JUMP)).any()
+
+
+def test_what_is_forgotten_moves_no_longer() -> None:
+    movers = Movers()
+    movers.whole(PERSON, NOWHERE, NOWHERE, scene())
+    movers.forget()
+    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene()).any()
+
+
+def test_the_floor_that_feet_stand_on_is_not_taken_along() -> None:
+    """A floor joins the person; a keyframe of half a second ago has seen most of it, but not what comes into view."""
+    movers, floor = Movers(), block(slice(25, 28), slice(0, 40))
+    movers.whole(PERSON, NOWHERE, NOWHERE, scene())
+    image = scene(PERSON | floor)
+    seen = floor.copy()
+    seen[:, 35:] = False
+    np.testing.assert_array_equal(movers.whole(NOWHERE, seen, NOWHERE, image), PERSON | (floor & ~seen))
+
+
+def test_where_everything_seems_to_move_the_pose_is_wrong_and_nothing_does() -> None:
+    movers = Movers()
+    assert not movers.whole(EVERYWHERE, NOWHERE, NOWHERE, scene()).any()
+    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene()).any(), "nor later"
+
+
+def test_where_nothing_is_known_nothing_moves() -> None:
+    assert not Movers().whole(NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32)).any()
+
+
+@given(
+    arrays(np.float32, st.tuples(st.integers(1, 8), st.integers(1, 8)), elements=st.sampled_from([0.0, 1.0, 1.1, 1.3]))
+)
+def test_surfaces_are_what_is_joined_without_a_jump(image: NDArray[np.float32]) -> None:
+    number = np.arange(image.size).reshape(image.shape)
+    pairs = [(number[1:], number[:-1]), (number[:, 1:], number[:, :-1])]
+    first, second = (np.concatenate([pair[k].ravel() for pair in pairs]) for k in (0, 1))
+    depth = image.ravel()
+    joined = (depth[first] > 0) & (depth[second] > 0) & (np.abs(depth[first] - depth[second]) < JUMP)
+    links = coo_matrix((np.ones(joined.sum()), (first[joined], second[joined])), (image.size, image.size))
+    _, wanted = connected_components(links, directed=False)
+    labels = surfaces(image).ravel()
+    np.testing.assert_array_equal(labels > 0, depth > 0)
+    known = depth > 0
+    same = labels[known][:, None] == labels[known][None]
+    np.testing.assert_array_equal(same, wanted[known][:, None] == wanted[known][None])
+
+
+def comer(index: int) -> Rectangle:
+    """A board that comes from the left, up to the camera, stands before it for a second, and leaves to the right."""
+    near = np.clip((index - 20) / 40, 0, 1)
+    left = -0.3 - 0.1 * max(20 - index, 0) + 0.05 * max(index - 90, 0)
+    edges = np.array([0.6, 0, 0]), np.array([0, 1.2, 0])
+    board = texture(np.random.default_rng(3), 300, 140, 400)
+    return Rectangle(np.array([left, -0.5, 2.0 - 1.1 * near]), *edges, board, moving=True)
+
+
+def test_who_comes_up_to_the_camera_does_not_take_it_along() -> None:
+    """He fills up to two thirds of the picture, and his edge is all that moves while he stands there."""
+    path, stamps = camera_path(110), np.arange(110) / 30
+    tracker, covered = Tracker(CAMERA, features=500), []
+    for index, (t, pose) in enumerate(zip(stamps, path, strict=True)):
+        rgb, depth, board = render([*room(), comer(index)], pose)
+        tracker.track(rgb, depth, float(t))
+        if 20 <= index < 90:
+            assert tracker.mask is not None
+            covered.append(tracker.mask[board].mean())
+    found = Trajectory(*tracker.trajectory())
+    assert len(found) == len(path)
+    assert score(Trajectory(stamps, path), found)["ate_m"]["rmse"] < 0.01
+    assert np.mean(covered) > 0.98
+    assert min(covered) > 0.8
