@@ -109,7 +109,8 @@ class FlowTracker:
         if inlier.sum() < least:
             return None
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
-        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, information, prior is not None)
+        pull = np.zeros(6) if prior is None else prior.pull(T_cw)
+        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, information, pull)
 
     def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
         """[m, 2] px as the lens shows them, of points of the map."""

@@ -7,6 +7,7 @@ enough; depth that agrees, or that lies hidden behind something, says nothing.
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ _VOTES = 2  # keyframes that must have looked through the place
 _GROWTH = 3  # coarse px a mover grows over its own surface
 _JUDGED, _MOVED = 0.6, 0.05  # of a part at rest: readings that agree, at least, and that do not, at most
 
+_Value = TypeVar("_Value", bound=np.generic)
 Coarse = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
@@ -101,6 +103,10 @@ class Geometry:
         image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
         return _grown(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
 
+    def coarse(self, picture: NDArray[_Value]) -> NDArray[_Value]:
+        """picture: [H, W] as measured. Returns [h, w]: what it says in the middle of every coarse pixel."""
+        return np.asarray(picture[self._row, self._column]).reshape(self._shape)
+
     def fine(self, movers: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """movers: [h, w] bool, coarse. Returns [H, W] bool, the same in the image as measured."""
         if not movers.any():
@@ -115,7 +121,7 @@ class Geometry:
         Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told from rest.
         """
         count, parts = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
-        coarse = np.asarray(parts[self._row, self._column]).reshape(self._shape)
+        coarse = self.coarse(parts)
         readings, still, moved = (
             np.bincount(coarse[chosen], minlength=count)
             for chosen in (comparison.image > 0, comparison.still, comparison.through.any(axis=0))

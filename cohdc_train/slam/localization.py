@@ -25,13 +25,14 @@ _CANDIDATES = 6  # keyframes tried per lost frame
 class Fit:
     """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference: the keyframe that
     sees most of them, None while the pose is a rough one; information: [6, 6] inverse covariance of the pose by what is
-    seen alone, in the camera's frame, 0 where nobody asks for it; weighed: what was expected has counted as well."""
+    seen alone, in the camera's frame, 0 where nobody asks for it; pull: [6] `Prior.pull` of what was expected, 0 where
+    it did not count."""
 
     T_cw: Array
     matches: Matches
     reference: Keyframe | None = None
     information: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    weighed: bool = False
+    pull: Array = field(default_factory=lambda: np.zeros(6))
 
 
 class Localizer:
@@ -108,7 +109,8 @@ class Localizer:
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
-        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], information, prior is not None)
+        pull = np.zeros(6) if prior is None else prior.pull(T_cw)
+        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], information, pull)
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

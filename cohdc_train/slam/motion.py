@@ -10,11 +10,11 @@ import numpy as np
 
 from cohdc_train.slam.optimization import Array, Prior, exp_se3, inverse, log_se3
 
-_ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard deviation
+ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard deviation
 _UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known
 _EXACT = np.full(6, 1e-4)  # m and rad: no pose is known better, however many points say so
-_LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
-_SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
+LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
+SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
 _PAUSE = 10.0  # s, after which nothing more is forgotten
 _FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
@@ -58,7 +58,7 @@ class Motion:
     @property
     def twist(self) -> Array | None:
         """[6] velocity, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t). None while it is not known."""
-        return self._velocity if self._t is not None and 0 < self._step <= _LONGEST else None
+        return self._velocity if self._t is not None and 0 < self._step <= LONGEST else None
 
     def expected(self, t: float) -> Expectation:
         """Where the camera is at t, s, later than the latest frame.
@@ -67,15 +67,15 @@ class Motion:
         """
         return Expectation(self._prior(t, self._predicted(t)), self._unrest < 1)
 
-    def found(self, t: float, T_cw: Array, information: Array, weighed: bool = False) -> None:
-        """The frame at t is at T_cw. information: [6, 6] of what it saw; weighed: T_cw is a compromise of that with
-        what was expected."""
+    def found(self, t: float, T_cw: Array, information: Array, pull: Array | None = None) -> None:
+        """The frame at t is at T_cw. information: [6, 6] of what it saw; pull: [6] `Prior.pull` of what was expected,
+        where T_cw is a compromise with that."""
         seen = np.asarray(np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(_EXACT**2), dtype=np.float64)
         if self._t is None:
             self._begin(T_cw, seen)
             self._unrest = 0.0
         else:
-            self._update(t, T_cw, seen, weighed)
+            self._update(t, T_cw, seen, pull)
         self._t = t
 
     def _begin(self, T_cw: Array, seen: Array, velocity: Array | None = None) -> None:
@@ -87,20 +87,20 @@ class Motion:
         self._covariance = np.diag(np.concatenate([np.zeros(6), _UNKNOWN**2]))
         self._covariance[:6, :6] = seen
 
-    def _update(self, t: float, T_cw: Array, seen: Array, weighed: bool) -> None:
+    def _update(self, t: float, T_cw: Array, seen: Array, pull: Array | None) -> None:
         assert self._t is not None
         covariance = self._predicted(t)
         expected = self._prior(t, covariance)
         self._step = t - self._t
         off = log_se3(T_cw @ inverse(expected.T_cw))
         spread = covariance[:6, :6] + seen
-        if weighed:
-            off = spread @ expected.information @ off  # by how much more it was before the compromise
+        if pull is not None:
+            off = off + seen @ pull  # by how much it was before the compromise
         inverted = np.linalg.inv(spread)
         surprise = float(off @ inverted @ off)
         self._unrest += _LEARNT * (min(surprise, _SURPRISE) / 6 - self._unrest)
         if surprise > _SURPRISE:
-            velocity = log_se3(T_cw @ inverse(self._T_cw)) / max(self._step, _SHORTEST)
+            velocity = log_se3(T_cw @ inverse(self._T_cw)) / max(self._step, SHORTEST)
             self._begin(T_cw, seen, velocity if np.all(np.abs(velocity) < 3 * _UNKNOWN) else None)
             return
         gain = covariance[:, :6] @ inverted
@@ -117,12 +117,12 @@ class Motion:
     def _ahead(self, t: float) -> float:
         """s for which the velocity is held."""
         assert self._t is not None
-        return min(max(t - self._t, 0.0), max(self._step, _LONGEST))
+        return min(max(t - self._t, 0.0), max(self._step, LONGEST))
 
     def _predicted(self, t: float) -> Array:
         """[12, 12] covariance at t, before anything is seen."""
         assert self._t is not None
         dt, identity = min(max(t - self._t, 0.0), _PAUSE), np.eye(6)
         step = np.block([[identity, dt * identity], [np.zeros((6, 6)), identity]])
-        noise = np.concatenate([dt * dt / 2 * np.diag(_ACCELERATION), dt * np.diag(_ACCELERATION)])
+        noise = np.concatenate([dt * dt / 2 * np.diag(ACCELERATION), dt * np.diag(ACCELERATION)])
         return np.asarray(step @ self._covariance @ step.T + noise @ noise.T)

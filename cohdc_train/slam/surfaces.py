@@ -29,26 +29,27 @@ class Movers:
         """The camera may be elsewhere."""
         self._latest = None
 
-    def whole(self, found: Bits, stood: Bits, rested: Bits, image: NDArray[np.float32]) -> Bits:
-        """What moves: the parts found to, and all of every surface of which enough is found, or moved just now.
+    def whole(self, found: Bits, stood: Bits, rested: Bits, image: NDArray[np.float32], masked: Bits) -> Bits:
+        """What moves beside the mask: the parts found to, and surfaces of which enough is found, or moved just now.
 
         found: [h, w] bool, seen to move; stood, rested: [h, w] bool, known to have stood there a moment ago and long
-        ago; image: [h, w] m, 0 = unknown.
+        ago; image: [h, w] m, 0 = unknown; masked: [h, w] bool, given as moving: no part of a surface, or a floor would
+        be one with those who stand on it, but when the mask misses it in the next frame, it goes on.
         """
-        known, before = image > 0, np.zeros_like(found)
+        known, before = (image > 0) & ~masked, np.zeros_like(found)
         if self._latest is not None:
             before = (self._latest > 0) & (np.abs(self._latest - image) < JUMP)
-        labels = surfaces(image)
+        labels = surfaces(np.where(known, image, np.float32(0)))
         count = int(labels.max(initial=0)) + 1
         size, hit, again, short, long = (
             np.bincount(labels[chosen & known], minlength=count) for chosen in (known, found, before, stood, rested)
         )
         starts = (hit >= _FOUND * size) & (short <= _STILL * size) & (size >= LEAST)
         goes_on = (again >= _AGAIN * size) & (long <= _STILL * size) & (size >= LEAST)
-        movers = np.asarray(found | known & (starts[labels] | goes_on[labels] & (before | ~stood)))
+        movers = np.asarray(known & (found | starts[labels] | goes_on[labels] & (before | ~stood)))
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
-        self._latest = np.where(movers, image, np.float32(0))
+        self._latest = np.where(movers | masked, image, np.float32(0))
         return movers
 
 

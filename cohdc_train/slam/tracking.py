@@ -3,6 +3,7 @@
 import time
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from cohdc_train.slam.motion import Expectation, Motion
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse
 from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.shutter import unrolled
+from cohdc_train.slam.smoothing import smoothed
 from cohdc_train.slam.window import adjust_everything
 
 MIN_START = 50  # points a first keyframe needs
@@ -86,7 +88,7 @@ class Tracker:
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
-        self._log: list[tuple[float, int, Array]] = []  # stamp, index of the reference keyframe, T of the frame in it
+        self._log: list[_Logged] = []
 
     def track(
         self,
@@ -110,7 +112,7 @@ class Tracker:
         fit = None if expected is None else self._by_flow(rgb, depth_m, expected, mask, late)
         if fit is not None:
             tracked = time.perf_counter()
-            self._motion.found(t, fit.T_cw, fit.information, fit.weighed)
+            self._motion.found(t, fit.T_cw, fit.information, fit.pull)
             self._remember(fit, t, False)
             return _pose_of(fit, t, False, start, tracked)
         given, mask = mask, self._dynamic(mask, depth_m, expected, t)
@@ -125,7 +127,7 @@ class Tracker:
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
         if fit is not None:
-            self._motion.found(t, fit.T_cw, fit.information, fit.weighed)
+            self._motion.found(t, fit.T_cw, fit.information, fit.pull)
         if fit is not None and keyframe:
             before = fit.T_cw
             fit = self._add_keyframe(features, fit, t, rgb, depth_m)
@@ -152,14 +154,20 @@ class Tracker:
         return 0 if self._loops is None else self._loops.closed
 
     def trajectory(self) -> tuple[Array, Array]:
-        """All tracked frames, each re-derived from its reference keyframe, or that one's heir, as the map has it now.
+        """All tracked frames, each re-derived from its reference keyframe, or that one's heir, as the map has it now,
+        and smoothed.
 
         Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
         """
-        stamps = np.array([t for t, _, _ in self._log])
-        keyframes = {index: self.map.pose(index) for index in {index for _, index, _ in self._log}}
-        poses = [inverse(relative @ keyframes[index]) for _, index, relative in self._log]
-        return stamps, np.stack(poses) if poses else np.zeros((0, 4, 4))
+        stamps = np.array([frame.t for frame in self._log])
+        if not self._log:
+            return stamps, np.zeros((0, 4, 4))
+        keyframes = {index: self.map.pose(index) for index in {frame.reference for frame in self._log}}
+        poses = np.stack([frame.relative @ keyframes[frame.reference] for frame in self._log])
+        if self.method.smoothing:
+            information, pulls = (np.stack(column) for column in list(zip(*self._log, strict=True))[3:])
+            poses = smoothed(stamps, poses, information, pulls)
+        return stamps, inverse(poses)
 
     def _by_flow(
         self,
@@ -251,7 +259,7 @@ class Tracker:
             self._refiner.remember(keyframe, pyramid)
         self._since_keyframe = 0
         self._reference_inliers = 0
-        return _fit_of(keyframe)
+        return replace(_fit_of(keyframe), information=fit.information, pull=fit.pull)
 
     def _cull_keyframes(self) -> None:
         in_use = set() if self._mapper is None else self._mapper.busy_with
@@ -263,7 +271,8 @@ class Tracker:
     def _close_loop(self, fit: Fit, loops: LoopCloser, picture: Picture) -> Fit:
         """The newest keyframe's fit, after a loop where it is then."""
         keyframe = self.map.keyframes[-1]
-        return _fit_of(keyframe) if loops.close(keyframe, picture) else fit
+        closed = loops.close(keyframe, picture)
+        return replace(_fit_of(keyframe), information=fit.information, pull=fit.pull) if closed else fit
 
     def _remember(self, fit: Fit | None, t: float, matched: bool) -> None:
         if fit is None or fit.reference is None:
@@ -275,7 +284,19 @@ class Tracker:
         if self._since_keyframe > 0 and matched:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
-        self._log.append((t, fit.reference.index, fit.T_cw @ inverse(fit.reference.T_cw)))
+        relative = fit.T_cw @ inverse(fit.reference.T_cw)
+        self._log.append(_Logged(t, fit.reference.index, relative, fit.information, fit.pull))
+
+
+class _Logged(NamedTuple):
+    """A tracked frame. reference: index of the keyframe it hangs on; relative: [4, 4] T of the frame in it, m;
+    information, pull: as those of `Fit`."""
+
+    t: float
+    reference: int
+    relative: Array
+    information: Array
+    pull: Array
 
 
 def _fit_of(keyframe: Keyframe) -> Fit:

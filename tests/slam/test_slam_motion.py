@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam import motion as motion_module
-from cohdc_train.slam.motion import _ACCELERATION, _EXACT, Motion
+from cohdc_train.slam.motion import _EXACT, ACCELERATION, Motion
 from cohdc_train.slam.optimization import (
     Observations,
     Prior,
@@ -139,7 +139,7 @@ def test_errors_are_as_large_as_foreseen() -> None:
                 off = log_se3(T_cw @ inverse(motion.expected(k * STEP).prior.T_cw))
                 squares.append(off @ motion.expected(k * STEP).prior.information @ off)
             motion.found(k * STEP, exp_se3(rng.normal(0, _EXACT)) @ T_cw, SURE)
-            push = rng.normal(0, _ACCELERATION)
+            push = rng.normal(0, ACCELERATION)
             T_cw = exp_se3(velocity * STEP + push * STEP**2 / 2) @ T_cw
             velocity = velocity + push * STEP
     assert 5.5 < np.mean(squares) < 6.5, np.mean(squares)
