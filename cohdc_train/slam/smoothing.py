@@ -12,9 +12,10 @@ from scipy.ndimage import uniform_filter1d
 from cohdc_train.slam.motion import ACCELERATION, LONGEST, SHORTEST
 from cohdc_train.slam.optimization import Array, exp_se3, inverse, log_se3
 
-_SHARED = np.full(6, 1e-3)  # m and rad: errors of a frame that its information does not know of
-_AROUND = 5  # frames on either side, over which the camera is held to be as calm or as shaken
-_ROUNDS = 4  # of finding out how shaken it is
+_SHARED = 2e-3  # m and rad: error of a frame that its information does not know of
+_LEAST = 1e-6  # 1/m^2 and 1/rad^2: information of a frame that saw nothing
+_AROUND = 15  # frames on either side, over which the camera is held to be as calm or as shaken
+_ROUNDS = 3  # of finding out how shaken it is
 _BAND = 18  # diagonals of the normal equations: three frames hang together
 
 
@@ -33,9 +34,11 @@ def smoothed(stamps: Array, poses: Array, information: Array, pulls: Array) -> A
     before, after = step[middle - 1], step[middle]
     shares = np.stack([1 / before, -1 / before - 1 / after, 1 / after])
     deviation = ACCELERATION * ((before + after) / 2)[:, None]
-    covariance = np.linalg.inv(information + 1e-6 * np.eye(6))
-    seen = np.linalg.inv(covariance + np.diag(_SHARED**2))
-    towards = np.einsum("nab,nbc,nc->na", seen, covariance, pulls)
+    certain, axes = np.linalg.eigh(information)
+    certain = np.maximum(certain, _LEAST)
+    shared = 1 / (1 + certain * _SHARED**2)
+    seen = (axes * (certain * shared)[:, None]) @ axes.transpose(0, 2, 1)
+    towards = np.einsum("nab,nb,ncb,nc->na", axes, shared, axes, pulls)
     motions = log_se3(poses[1:] @ inverse(poses[:-1]))
     change = motions[middle] / after[:, None] - motions[middle - 1] / before[:, None]
     weight = np.ones((len(middle), 6))

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam import motion as motion_module
+from cohdc_train.slam.method import Method
 from cohdc_train.slam.motion import _EXACT, ACCELERATION, Motion
 from cohdc_train.slam.optimization import (
     Observations,
@@ -209,7 +210,7 @@ def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(monkeypatch: pytes
     errors = {}
     for few in (0, motion_module._FEW):
         monkeypatch.setattr(motion_module, "_FEW", few)
-        tracker = Tracker(CAMERA, features=200)
+        tracker = Tracker(CAMERA, features=200, method=Method(smoothing=False))
         poses = [
             tracker.track(rgb, depth, k / 30, almost_all if k >= 10 else None)
             for k, (rgb, depth, _) in enumerate(views)
