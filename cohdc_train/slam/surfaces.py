@@ -14,6 +14,7 @@ LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
 _FOUND = 0.4  # share of a surface that must be found moving for all of it to move
 _AGAIN = 0.5  # share of it that must have moved in the frame before, to go on
 _STILL = 0.3  # share of it, at most, that is known to have stood there
+_BAND = 3  # coarse px: a mask is so much wider than what it covers, at most
 _MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
 
 Bits = NDArray[np.bool_]  # [h, w], coarse
@@ -49,8 +50,15 @@ class Movers:
         movers = np.asarray(known & (found | starts[labels] | goes_on[labels] & (before | ~stood)))
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
-        self._latest = np.where(movers | masked, image, np.float32(0))
+        self._latest = np.where(movers | _inside(masked), image, np.float32(0))
         return movers
+
+
+def _inside(masked: Bits) -> Bits:
+    """The mask without its rim, where it covers what lies behind; the picture's border is one, too."""
+    square = np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8)
+    bits = masked.astype(np.uint8)
+    return np.asarray(cv2.erode(bits, square, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0)
 
 
 def surfaces(image: NDArray[np.float32]) -> NDArray[np.int32]:

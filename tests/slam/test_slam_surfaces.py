@@ -61,11 +61,18 @@ def test_who_comes_after_in_the_same_place_does_not_move_for_it() -> None:
 
 
 def test_whom_a_mask_covered_goes_on_where_the_next_one_misses_him() -> None:
-    movers = Movers()
-    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), PERSON).any(), "he is in the mask already"
-    rest = PERSON & ~THIRD
-    np.testing.assert_array_equal(movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), rest)
+    movers, wide = Movers(), block(slice(7, 28), slice(7, 23))
+    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), wide).any(), "he is in the mask already"
+    np.testing.assert_array_equal(movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), PERSON & ~THIRD)
     np.testing.assert_array_equal(movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+
+
+def test_a_wall_that_comes_out_from_under_the_edge_of_a_mask_stands_still() -> None:
+    """Between the picture's edge and somebody who walks away from it; masks reach 3 px beyond him."""
+    movers = Movers()
+    for step in range(12):
+        person, wide = (block(slice(0, 30), slice(max(step - more, 0), step + 10 + more)) for more in (0, 3))
+        assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(person), wide).any()
 
 
 def test_a_floor_is_no_part_of_who_is_masked_on_it() -> None:
