@@ -50,15 +50,18 @@ class Movers:
         movers = np.asarray(known & (found | starts[labels] | goes_on[labels] & (before | ~stood)))
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
-        self._latest = np.where(movers | _inside(masked), image, np.float32(0))
+        self._latest = np.where(movers | _covered(masked, image), image, np.float32(0))
         return movers
 
 
-def _inside(masked: Bits) -> Bits:
-    """The mask without its rim, where it covers what lies behind; the picture's border is one, too."""
+def _covered(masked: Bits, image: NDArray[np.float32]) -> Bits:
+    """[h, w] bool: the surfaces under a mask that reach further in than its rim, where it covers what lies behind."""
     square = np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8)
-    bits = masked.astype(np.uint8)
-    return np.asarray(cv2.erode(bits, square, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0)
+    inner = cv2.erode(masked.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
+    labels = surfaces(np.where(masked, image, np.float32(0)))
+    reaches = np.bincount(labels[inner], minlength=int(labels.max(initial=0)) + 1) >= LEAST
+    reaches[0] = False
+    return np.asarray(reaches[labels])
 
 
 def surfaces(image: NDArray[np.float32]) -> NDArray[np.int32]:
