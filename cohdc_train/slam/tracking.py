@@ -3,7 +3,6 @@
 import time
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import DynamicMask
 from cohdc_train.slam.features import Corners, FeatureExtractor, Features, gray_of
 from cohdc_train.slam.flow_tracking import FlowTracker
+from cohdc_train.slam.frame_log import FrameLog
 from cohdc_train.slam.geometry import Geometry
 from cohdc_train.slam.keyframe_culling import cull_keyframes
 from cohdc_train.slam.localization import LOCAL_KEYFRAMES, Fit, Localizer, thumbnail
@@ -26,7 +26,6 @@ from cohdc_train.slam.motion import Expectation, Motion
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse
 from cohdc_train.slam.refinement import Pyramid, Refiner
 from cohdc_train.slam.shutter import unrolled
-from cohdc_train.slam.smoothing import smoothed
 from cohdc_train.slam.window import adjust_everything
 
 MIN_START = 50  # points a first keyframe needs
@@ -88,7 +87,7 @@ class Tracker:
         self._last: Fit | None = None
         self._reference_inliers = 0
         self._since_keyframe = 0
-        self._log: list[_Logged] = []
+        self._log = FrameLog()
 
     def track(
         self,
@@ -159,15 +158,7 @@ class Tracker:
 
         Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
         """
-        stamps = np.array([frame.t for frame in self._log])
-        if not self._log:
-            return stamps, np.zeros((0, 4, 4))
-        keyframes = {index: self.map.pose(index) for index in {frame.reference for frame in self._log}}
-        poses = np.stack([frame.relative @ keyframes[frame.reference] for frame in self._log])
-        if self.method.smoothing:
-            information, pulls = (np.stack(column) for column in list(zip(*self._log, strict=True))[3:])
-            poses = smoothed(stamps, poses, information, pulls)
-        return stamps, inverse(poses)
+        return self._log.trajectory(self.map, self.method.smoothing)
 
     def _by_flow(
         self,
@@ -284,19 +275,7 @@ class Tracker:
         if self._since_keyframe > 0 and matched:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
-        relative = fit.T_cw @ inverse(fit.reference.T_cw)
-        self._log.append(_Logged(t, fit.reference.index, relative, fit.information, fit.pull))
-
-
-class _Logged(NamedTuple):
-    """A tracked frame. reference: index of the keyframe it hangs on; relative: [4, 4] T of the frame in it, m;
-    information, pull: as those of `Fit`."""
-
-    t: float
-    reference: int
-    relative: Array
-    information: Array
-    pull: Array
+        self._log.append(t, fit, fit.reference)
 
 
 def _fit_of(keyframe: Keyframe) -> Fit:
