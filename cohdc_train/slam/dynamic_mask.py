@@ -43,7 +43,7 @@ class DynamicMask:
         long_ago = comparison.only([row[k.index] for k in older])
         found = self._geometry.movers(comparison.only([row[k.index] for k in judges]))
         masked = np.zeros_like(found) if mask is None else self._geometry.coarse(mask)
-        found = self._movers.whole(found, stood, long_ago.still, comparison.image, masked)
+        found = self._movers.whole(t, found, stood, long_ago.still, comparison.image, masked)
         moves = grow(self._geometry.fine(found), _BAND)
         if mask is None:
             return moves if moves.any() else None

@@ -13,7 +13,7 @@ from cohdc_train.slam.motion import ACCELERATION, LONGEST, SHORTEST
 from cohdc_train.slam.optimization import Array, exp_se3, inverse, log_se3
 
 _SHARED = 2e-3  # m and rad: error of a frame that its information does not know of
-_LEAST = 1e-6  # 1/m^2 and 1/rad^2: information of a frame that saw nothing
+_LEAST = 1.0  # 1/m^2 and 1/rad^2: information of a frame that saw nothing
 _AROUND = 15  # frames on either side, over which the camera is held to be as calm or as shaken
 _ROUNDS = 3  # of finding out how shaken it is
 _BAND = 18  # diagonals of the normal equations: three frames hang together
@@ -41,14 +41,20 @@ def smoothed(stamps: Array, poses: Array, information: Array, pulls: Array) -> A
     towards = np.einsum("nab,nb,ncb,nc->na", axes, shared, axes, pulls)
     motions = log_se3(poses[1:] @ inverse(poses[:-1]))
     change = motions[middle] / after[:, None] - motions[middle - 1] / before[:, None]
+    gaps = np.flatnonzero(np.diff(middle) > 1) + 1
     weight = np.ones((len(middle), 6))
     small = np.zeros((len(stamps), 6))
     for _ in range(_ROUNDS if len(middle) else 0):
         small = _solved(seen, towards, middle, shares, change, weight / deviation**2)
         around = np.stack([small[middle - 1], small[middle], small[middle + 1]])
         left = (change + np.einsum("km,kma->ma", shares, around)) / deviation
-        weight = 1 / np.maximum(1.0, uniform_filter1d(left**2, 2 * _AROUND + 1, axis=0, mode="nearest"))
+        weight = 1 / np.maximum(1.0, np.concatenate([_around(run) for run in np.split(left**2, gaps)]))
     return np.asarray(exp_se3(small) @ poses, dtype=np.float64)
+
+
+def _around(squares: Array) -> Array:
+    """squares: [k, 6] of frames in a row. Returns [k, 6], their mean over the frames around each."""
+    return np.asarray(uniform_filter1d(squares, 2 * _AROUND + 1, axis=0, mode="nearest"))
 
 
 def _solved(

@@ -2,7 +2,7 @@
 
 A surface is a connected part of a depth image without jumps. Who comes up to the camera is found by depth where some
 keyframe has looked through the place; soon most of him is where none has looked, being too near. He moves until he has
-been seen at rest.
+been seen at rest, or nothing of him is found any longer.
 """
 
 import cv2
@@ -14,9 +14,11 @@ LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
 _FOUND = 0.4  # share of a surface that must be found moving for all of it to move
 _AGAIN = 0.5  # share of it that must have moved in the frame before, to go on
 _STILL = 0.3  # share of it, at most, that is known to have stood there
+_LASTS = 0.5  # s for which a surface goes on that is neither found, not even in part, nor masked
 _BAND = 3  # coarse px: a mask is so much wider than what it covers, at most
 _MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
 
+Array = NDArray[np.float64]
 Bits = NDArray[np.bool_]  # [h, w], coarse
 
 
@@ -25,18 +27,22 @@ class Movers:
 
     def __init__(self) -> None:
         self._latest: NDArray[np.float32] | None = None  # [h, w] m, depth of what moved, 0 elsewhere
+        self._seen: NDArray[np.float64] | None = None  # [h, w] s, when it was last found or masked, -inf elsewhere
+        self._masked: Bits | None = None
 
     def forget(self) -> None:
         """The camera may be elsewhere."""
-        self._latest = None
+        self._latest = self._seen = self._masked = None
 
-    def whole(self, found: Bits, stood: Bits, rested: Bits, image: NDArray[np.float32], masked: Bits) -> Bits:
+    def whole(self, t: float, found: Bits, stood: Bits, rested: Bits, image: NDArray[np.float32], masked: Bits) -> Bits:
         """What moves beside the mask: the parts found to, and surfaces of which enough is found, or moved just now.
 
-        found: [h, w] bool, seen to move; stood, rested: [h, w] bool, known to have stood there a moment ago and long
-        ago; image: [h, w] m, 0 = unknown; masked: [h, w] bool, given as moving: no part of a surface, or a floor would
-        be one with those who stand on it, but when the mask misses it in the next frame, it goes on.
+        t: s, of the frame; found: [h, w] bool, seen to move; stood, rested: [h, w] bool, known to have stood there a
+        moment ago and long ago; image: [h, w] m, 0 = unknown; masked: [h, w] bool, given as moving: no part of a
+        surface, or a floor would be one with those who stand on it, but when the mask misses it later on, it goes on.
         """
+        if not (image > 0).any():
+            return np.zeros_like(found)
         known, before = (image > 0) & ~masked, np.zeros_like(found)
         if self._latest is not None:
             before = (self._latest > 0) & (np.abs(self._latest - image) < JUMP)
@@ -45,13 +51,24 @@ class Movers:
         size, hit, again, short, long = (
             np.bincount(labels[chosen & known], minlength=count) for chosen in (known, found, before, stood, rested)
         )
+        seen = self._last_seen(t, hit, labels, before & known)
         starts = (hit >= _FOUND * size) & (short <= _STILL * size) & (size >= LEAST)
-        goes_on = (again >= _AGAIN * size) & (long <= _STILL * size) & (size >= LEAST)
+        goes_on = (again >= _AGAIN * size) & (long <= _STILL * size) & (size >= LEAST) & (t - seen <= _LASTS)
         movers = np.asarray(known & (found | starts[labels] | goes_on[labels] & (before | ~stood)))
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
-        self._latest = np.where(movers | _covered(masked, image), image, np.float32(0))
+        covered = _covered(masked if self._masked is None else masked & self._masked, image)
+        self._latest = np.where(movers | covered, image, np.float32(0))
+        self._seen = np.where(covered, t, np.where(movers, seen[labels], -np.inf))
+        self._masked = masked
         return movers
+
+    def _last_seen(self, t: float, hit: NDArray[np.int64], labels: NDArray[np.int32], before: Bits) -> Array:
+        """[surfaces] s, when each was last found to move, if only in part, or masked; -inf where it never was."""
+        seen = np.full(len(hit), -np.inf)
+        if self._seen is not None:
+            np.maximum.at(seen, labels[before], self._seen[before])
+        return np.where(hit >= LEAST, t, seen)
 
 
 def _covered(masked: Bits, image: NDArray[np.float32]) -> Bits:

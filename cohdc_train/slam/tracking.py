@@ -250,7 +250,7 @@ class Tracker:
             self._refiner.remember(keyframe, pyramid)
         self._since_keyframe = 0
         self._reference_inliers = 0
-        return replace(_fit_of(keyframe), information=fit.information, pull=fit.pull)
+        return replace(_fit_of(keyframe), information=fit.information)
 
     def _cull_keyframes(self) -> None:
         in_use = set() if self._mapper is None else self._mapper.busy_with
@@ -263,7 +263,7 @@ class Tracker:
         """The newest keyframe's fit, after a loop where it is then."""
         keyframe = self.map.keyframes[-1]
         closed = loops.close(keyframe, picture)
-        return replace(_fit_of(keyframe), information=fit.information, pull=fit.pull) if closed else fit
+        return replace(_fit_of(keyframe), information=fit.information) if closed else fit
 
     def _remember(self, fit: Fit | None, t: float, matched: bool) -> None:
         if fit is None or fit.reference is None:

@@ -23,7 +23,7 @@ IMAGES_PER_ROOM = 5
 PEOPLE_PER_ROOM = 3
 SMALLEST_SHARE = 1 / 200  # of the image's pixels; a smaller visible part of a person is annotated as a crowd: ignored
 SUPERSAMPLING = 1.5
-NEAREST = 0.35  # m from the camera to the middle of a person, whom it would otherwise stand in
+NEAREST, FARTHEST = 0.35, 6.0  # m: nearer, the camera would stand in a person; further, people outside of the room
 DISTANCE = (0.7, 3.7)  # m, of people from the camera
 _COUNT_CHANCE = (0.08, 0.42, 0.34, 0.16)  # of 0, 1, .. 3 people
 
@@ -176,8 +176,10 @@ def _check(train: int, val: int, size: tuple[int, int], seed: int, distance: tup
         raise DataError(f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48")
     if seed < 0:
         raise DataError(f"seed: {seed} is negative")
-    if not NEAREST <= distance[0] <= distance[1]:
-        raise DataError(f"distance: {distance[0]} to {distance[1]} m; needs {NEAREST} <= nearest <= farthest")
+    if not NEAREST <= distance[0] <= distance[1] <= FARTHEST:
+        raise DataError(
+            f"distance: {distance[0]} to {distance[1]} m; needs {NEAREST} <= nearest <= farthest <= {FARTHEST}"
+        )
 
 
 def _render_split(

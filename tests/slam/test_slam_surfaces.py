@@ -34,37 +34,37 @@ def scene(person: Bits = PERSON, depth: float = 1.0) -> NDArray[np.float32]:
 
 
 def test_of_a_surface_that_is_found_by_half_all_moves_and_nothing_else() -> None:
-    np.testing.assert_array_equal(Movers().whole(HALF, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+    np.testing.assert_array_equal(Movers().whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
 
 
 def test_of_one_that_is_found_by_less_or_was_just_seen_there_only_that_moves() -> None:
-    np.testing.assert_array_equal(Movers().whole(THIRD, NOWHERE, NOWHERE, scene(), NOWHERE), THIRD)
-    np.testing.assert_array_equal(Movers().whole(HALF, HALF, NOWHERE, scene(), NOWHERE), HALF)
+    np.testing.assert_array_equal(Movers().whole(0.0, THIRD, NOWHERE, NOWHERE, scene(), NOWHERE), THIRD)
+    np.testing.assert_array_equal(Movers().whole(0.0, HALF, HALF, NOWHERE, scene(), NOWHERE), HALF)
 
 
 def test_what_moved_goes_on_though_nothing_finds_it_until_it_was_seen_at_rest() -> None:
     movers = Movers()
-    movers.whole(HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
     for step in range(1, 6):
         image = scene(np.roll(PERSON, step, axis=1), 1.0 - 0.1 * step)
-        moved = movers.whole(NOWHERE, EVERYWHERE & (image > 2), NOWHERE, image, NOWHERE)
+        moved = movers.whole(0.0, NOWHERE, EVERYWHERE & (image > 2), NOWHERE, image, NOWHERE)
         np.testing.assert_array_equal(moved, image < 2)
     there = image < 2
-    np.testing.assert_array_equal(movers.whole(NOWHERE, EVERYWHERE, NOWHERE, image, NOWHERE), there)
-    assert not movers.whole(NOWHERE, EVERYWHERE, EVERYWHERE, image, NOWHERE).any()
+    np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, EVERYWHERE, NOWHERE, image, NOWHERE), there)
+    assert not movers.whole(0.0, NOWHERE, EVERYWHERE, EVERYWHERE, image, NOWHERE).any()
 
 
 def test_who_comes_after_in_the_same_place_does_not_move_for_it() -> None:
     movers = Movers()
-    movers.whole(PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
-    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(depth=1.0 + 2 * JUMP), NOWHERE).any()
+    movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
+    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(depth=1.0 + 2 * JUMP), NOWHERE).any()
 
 
 def test_whom_a_mask_covered_goes_on_where_the_next_one_misses_him() -> None:
     movers, wide = Movers(), block(slice(7, 28), slice(7, 23))
-    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), wide).any(), "he is in the mask already"
-    np.testing.assert_array_equal(movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), PERSON & ~THIRD)
-    np.testing.assert_array_equal(movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), wide).any(), "he is in the mask already"
+    np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), PERSON & ~THIRD)
+    np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
 
 
 def test_a_wall_that_comes_out_from_under_the_edge_of_a_mask_stands_still() -> None:
@@ -72,41 +72,41 @@ def test_a_wall_that_comes_out_from_under_the_edge_of_a_mask_stands_still() -> N
     movers = Movers()
     for step in range(12):
         person, wide = (block(slice(0, 30), slice(max(step - more, 0), step + 10 + more)) for more in (0, 3))
-        assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(person), wide).any()
+        assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(person), wide).any()
 
 
 def test_a_floor_is_no_part_of_who_is_masked_on_it() -> None:
     floor = block(slice(25, 28), slice(0, 40))
     found = PERSON | block(slice(25, 28), slice(0, 10))
     wanted = found & ~PERSON
-    np.testing.assert_array_equal(Movers().whole(found, NOWHERE, NOWHERE, scene(PERSON | floor), PERSON), wanted)
+    np.testing.assert_array_equal(Movers().whole(0.0, found, NOWHERE, NOWHERE, scene(PERSON | floor), PERSON), wanted)
 
 
 def test_what_is_forgotten_moves_no_longer() -> None:
     movers = Movers()
-    movers.whole(PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
     movers.forget()
-    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
+    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
 
 
 def test_the_floor_that_feet_stand_on_is_not_taken_along() -> None:
     """A floor joins the person; a keyframe of half a second ago has seen most of it, but not what comes into view."""
     movers, floor = Movers(), block(slice(25, 28), slice(0, 40))
-    movers.whole(PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
     image = scene(PERSON | floor)
     seen = floor.copy()
     seen[:, 35:] = False
-    np.testing.assert_array_equal(movers.whole(NOWHERE, seen, NOWHERE, image, NOWHERE), PERSON | (floor & ~seen))
+    np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, seen, NOWHERE, image, NOWHERE), PERSON | (floor & ~seen))
 
 
 def test_where_everything_seems_to_move_the_pose_is_wrong_and_nothing_does() -> None:
     movers = Movers()
-    assert not movers.whole(EVERYWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
-    assert not movers.whole(NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any(), "nor later"
+    assert not movers.whole(0.0, EVERYWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
+    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any(), "nor later"
 
 
 def test_where_nothing_is_known_nothing_moves() -> None:
-    assert not Movers().whole(NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32), NOWHERE).any()
+    assert not Movers().whole(0.0, NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32), NOWHERE).any()
 
 
 @given(

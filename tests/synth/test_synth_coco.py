@@ -125,6 +125,7 @@ def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
         ({"seed": -3}, "seed: -3"),
         ({"distance": (0.2, 3.0)}, "distance: 0.2 to 3.0 m"),
         ({"distance": (2.0, 1.0)}, "distance: 2.0 to 1.0 m"),
+        ({"distance": (0.5, float("inf"))}, "distance: 0.5 to inf m"),
     ],
 )
 def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
