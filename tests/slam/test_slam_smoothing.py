@@ -115,6 +115,22 @@ def test_frames_on_both_sides_of_a_gap_know_nothing_of_each_other() -> None:
     np.testing.assert_allclose(alone(stamps, measured, information), np.concatenate(apart), atol=1e-12)
 
 
+def test_nor_does_one_side_tell_how_calm_the_other_is() -> None:
+    stamps, _, measured, information = noisy(2, 40, 0.005)
+    measured[:20] = noisy(5, 20, 0.03)[2]
+    stamps[20:] += 1.0
+    np.testing.assert_allclose(
+        alone(stamps, measured, information)[20:], alone(stamps[20:], measured[20:], information[20:]), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("step", [0.0011, 0.033, 0.2])
+def test_frames_that_saw_nothing_are_no_fault(step: float) -> None:
+    _, _, measured, information = noisy(6, 60, 0.005)
+    way = alone(step * np.arange(60), measured, 0 * information)
+    assert np.isfinite(way).all()
+
+
 @pytest.mark.parametrize("frames", [0, 1, 2])
 def test_few_frames_stay(frames: int) -> None:
     stamps, _, measured, information = noisy(3, 3, 0.01)

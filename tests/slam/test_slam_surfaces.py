@@ -1,6 +1,9 @@
 """Movers as whole surfaces that go on moving: known answers on coarse images, and who comes up to the camera."""
 
+from itertools import pairwise
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -9,6 +12,7 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from cohdc_train.slam.optimization import exp_se3
 from cohdc_train.slam.surfaces import JUMP, Bits, Movers, surfaces
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.trajectory import Trajectory, score
@@ -52,6 +56,29 @@ def test_what_moved_goes_on_though_nothing_finds_it_until_it_was_seen_at_rest() 
     there = image < 2
     np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, EVERYWHERE, NOWHERE, image, NOWHERE), there)
     assert not movers.whole(0.0, NOWHERE, EVERYWHERE, EVERYWHERE, image, NOWHERE).any()
+
+
+def test_what_nothing_finds_nor_masks_goes_on_for_half_a_second() -> None:
+    movers, trace = Movers(), block(slice(10, 12), slice(10, 14))
+    movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
+    for t in (0.4, 0.8, 1.2):
+        np.testing.assert_array_equal(movers.whole(t, trace, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+    np.testing.assert_array_equal(movers.whole(1.6, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+    assert not movers.whole(2.0, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE).any()
+
+
+def test_a_frame_without_depth_says_nothing() -> None:
+    movers = Movers()
+    movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
+    assert not movers.whole(0.1, NOWHERE, NOWHERE, NOWHERE, scene() * 0, NOWHERE).any()
+    np.testing.assert_array_equal(movers.whole(0.2, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+
+
+def test_a_mask_of_one_frame_is_not_remembered() -> None:
+    movers, wall = Movers(), block(slice(0, 30), slice(5, 35))
+    movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE)
+    movers.whole(0.1, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), wall)
+    assert not movers.whole(0.2, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE).any()
 
 
 def test_who_comes_after_in_the_same_place_does_not_move_for_it() -> None:
@@ -151,3 +178,20 @@ def test_who_comes_up_to_the_camera_does_not_take_it_along() -> None:
     assert score(Trajectory(stamps, path), found)["ate_m"]["rmse"] < 0.01
     assert np.mean(covered) > 0.98
     assert min(covered) > 0.8
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_a_false_mask_does_not_lose_a_robot_that_turns(frames: int) -> None:
+    """In a round room, whose wall is one surface of which no keyframe is two seconds old, at 45 degrees a second."""
+    rng, corners = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 17)
+    places = 2 * np.stack([np.sin(corners), -np.ones(17), np.cos(corners)], axis=1)
+    wall = [Rectangle(a, b - a, np.array([0, 4.0, 0]), texture(rng, 800, 200, 500)) for a, b in pairwise(places)]
+    tracker, most = Tracker(CAMERA, features=500), np.zeros((240, 320), dtype=np.bool_)
+    most[:, 40:280] = True
+    for k in range(60):
+        turned = exp_se3(np.array([0, 0, 0, 0, np.deg2rad(1.5) * k, 0]))
+        rgb, depth, _ = render(wall, turned)
+        pose = tracker.track(rgb, depth, k / 30, most if 20 <= k < 20 + frames else most & False)
+        assert pose.tracked, k
+    assert tracker.mask is not None
+    assert not tracker.mask.any()
