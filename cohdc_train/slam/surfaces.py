@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.optimization import Array
+
 JUMP = 0.12  # m of depth from one coarse pixel to the next, from which on they belong to two surfaces
 LEAST = 8  # coarse px of a mover: smaller ones are noise at edges
 _FOUND = 0.4  # share of a surface that must be found moving for all of it to move
@@ -18,7 +20,6 @@ _LASTS = 0.5  # s for which a surface goes on that is neither found, not even in
 _BAND = 3  # coarse px: a mask is so much wider than what it covers, at most
 _MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
 
-Array = NDArray[np.float64]
 Bits = NDArray[np.bool_]  # [h, w], coarse
 
 
