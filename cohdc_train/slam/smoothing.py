@@ -5,7 +5,6 @@ that come later count as well. All poses are found at once.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
@@ -14,6 +13,7 @@ from cohdc_train.slam.optimization import Array, exp_se3, inverse, log_se3
 
 _SHARED = 2e-3  # m and rad: error of a frame that its information does not know of
 _LEAST = 1.0  # 1/m^2 and 1/rad^2: information of a frame that saw nothing
+_LEAST_SHARE = 0.01  # of the variance that frames claim, which is left to them at least
 _AROUND = 15  # frames on either side, over which the camera is held to be as calm or as shaken
 _ROUNDS = 3  # of finding out how shaken it is
 _BAND = 18  # diagonals of the normal equations: three frames hang together
@@ -26,52 +26,60 @@ def smoothed(stamps: Array, poses: Array, information: Array, pulls: Array) -> A
 
     Frames further apart than LONGEST have nothing to do with each other.
     """
+    step = np.diff(stamps)
+    ends = np.flatnonzero((step <= SHORTEST) | (step > LONGEST)) + 1
+    runs = [np.split(values, ends) for values in (stamps, poses, information, pulls)]
+    return np.concatenate([_smoothed_run(*run) for run in zip(*runs, strict=True)])
+
+
+def _smoothed_run(stamps: Array, poses: Array, information: Array, pulls: Array) -> Array:
+    """The same of frames that follow closely upon each other."""
     if len(stamps) < 3:
         return poses
-    step = np.diff(stamps)
-    near = (step > SHORTEST) & (step <= LONGEST)
-    middle = np.flatnonzero(near[:-1] & near[1:]) + 1
-    before, after = step[middle - 1], step[middle]
-    shares = np.stack([1 / before, -1 / before - 1 / after, 1 / after])
+    before, after = np.diff(stamps)[:-1], np.diff(stamps)[1:]
+    shares = np.stack([1 / before, -1 / before - 1 / after, 1 / after])[..., None]
     deviation = ACCELERATION * ((before + after) / 2)[:, None]
+    motions = log_se3(poses[1:] @ inverse(poses[:-1]))
+    change = motions[1:] / after[:, None] - motions[:-1] / before[:, None]
     certain, axes = np.linalg.eigh(information)
     certain = np.maximum(certain, _LEAST)
-    shared = 1 / (1 + certain * _SHARED**2)
-    seen = (axes * (certain * shared)[:, None]) @ axes.transpose(0, 2, 1)
-    towards = np.einsum("nab,nb,ncb,nc->na", axes, shared, axes, pulls)
-    motions = log_se3(poses[1:] @ inverse(poses[:-1]))
-    change = motions[middle] / after[:, None] - motions[middle - 1] / before[:, None]
-    gaps = np.flatnonzero(np.diff(middle) > 1) + 1
-    weight = np.ones((len(middle), 6))
-    small = np.zeros((len(stamps), 6))
-    for _ in range(_ROUNDS if len(middle) else 0):
-        small = _solved(seen, towards, middle, shares, change, weight / deviation**2)
-        around = np.stack([small[middle - 1], small[middle], small[middle + 1]])
-        left = (change + np.einsum("km,kma->ma", shares, around)) / deviation
-        weight = 1 / np.maximum(1.0, np.concatenate([_around(run) for run in np.split(left**2, gaps)]))
+    away = np.einsum("nab,nb,ncb,nc->na", axes, 1 / certain, axes, pulls)
+    seen = (axes * (certain / (1 + certain * _SHARED**2))[:, None]) @ axes.transpose(0, 2, 1)
+    seen = seen * _sharper(seen, shares, change, deviation)
+    towards = np.einsum("nab,nb->na", seen, away)
+    weight, small = np.ones_like(change), np.zeros((len(stamps), 6))
+    for _ in range(_ROUNDS):
+        small = _solved(seen, towards, shares, change, weight / deviation**2)
+        left = (change + (shares * np.stack(_threes(small))).sum(axis=0)) / deviation
+        weight = 1 / np.maximum(1.0, uniform_filter1d(left**2, 2 * _AROUND + 1, axis=0, mode="nearest"))
     return np.asarray(exp_se3(small) @ poses, dtype=np.float64)
 
 
-def _around(squares: Array) -> Array:
-    """squares: [k, 6] of frames in a row. Returns [k, 6], their mean over the frames around each."""
-    return np.asarray(uniform_filter1d(squares, 2 * _AROUND + 1, axis=0, mode="nearest"))
+def _threes(values: Array) -> tuple[Array, Array, Array]:
+    """values: [n, ...] of frames. Those of the frame before, of the frame and of the one after, [n - 2, ...] each."""
+    return values[:-2], values[1:-1], values[2:]
 
 
-def _solved(
-    seen: Array, towards: Array, middle: NDArray[np.int64], shares: Array, change: Array, weight: Array
-) -> Array:
-    """[n, 6] the small motions that reconcile frames with changes of velocity [m, 6] at the middle ones.
+def _sharper(seen: Array, shares: Array, change: Array, deviation: Array) -> Array:
+    """[6, 6] how much more frames know than they say: with so much noise velocity would change more than it does."""
+    own = np.diagonal(np.linalg.inv(seen), axis1=1, axis2=2)
+    foreseen = (shares**2 * np.stack(_threes(own))).sum(axis=0).mean(axis=0)
+    share = np.clip(((change**2).mean(axis=0) - (deviation**2).mean(axis=0)) / foreseen, _LEAST_SHARE, 1.0)
+    return np.asarray(1 / np.sqrt(share[:, None] * share[None]))
+
+
+def _solved(seen: Array, towards: Array, shares: Array, change: Array, weight: Array) -> Array:
+    """[n, 6] the small motions that reconcile frames with changes of velocity [n - 2, 6].
 
     seen: [n, 6, 6] information; towards: [n, 6] the same times the small motion to where what a frame saw puts it;
-    shares: [3, m] of the motions of the frame before, the middle one and the one after in a change; weight: [m, 6].
+    shares: [3, n - 2, 1] of the motions of three frames in a change; weight: [n - 2, 6].
     """
     n = len(seen)
     diagonal, right = np.zeros((3, n, 6)), towards.copy()  # by how many frames a block lies below the diagonal
     for row in range(3):
-        np.add.at(right, middle + row - 1, -shares[row][:, None] * weight * change)
+        _threes(right)[row][...] -= shares[row] * weight * change
         for column in range(row + 1):
-            product = (shares[row] * shares[column])[:, None] * weight
-            np.add.at(diagonal[row - column], middle + column - 1, product)
+            _threes(diagonal[row - column])[column][...] += shares[row] * shares[column] * weight
     band = np.zeros((_BAND, 6 * n))
     for offset in range(6):
         for a in range(offset, 6):
