@@ -68,13 +68,10 @@ def bench(
 def _fit_options(
     config: Path | None, options: list[str], epochs: int | None, train_minutes: float | None
 ) -> tuple[str, ...]:
+    from cohdc_train.bench.training import budget
     from cohdc_train.errors import CohdcError
 
     if (epochs is None) == (train_minutes is None):
         raise CohdcError(f"a budget is needed: --epochs or --train-minutes, not {'none' if epochs is None else 'both'}")
     given = (f"--config={config}",) if config is not None else ()
-    if train_minutes is not None:
-        seconds = round(60 * train_minutes)
-        clock = f"00:{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}"
-        return (*given, *options, f"--trainer.max_time={clock}", "--trainer.max_epochs=-1")
-    return (*given, *options, f"--trainer.max_epochs={epochs}")
+    return (*given, *options, *budget(epochs, train_minutes))

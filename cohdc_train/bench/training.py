@@ -46,6 +46,15 @@ def train(folder: Path, data: Sequence[Path], options: Sequence[str], threads: i
     return Trained(checkpoint, seconds)
 
 
+def budget(epochs: int | None, minutes: float | None) -> tuple[str, ...]:
+    """Options of `cohdc fit` for a training of so many epochs, or of so many minutes where those are given."""
+    if minutes is None:
+        return (f"--trainer.max_epochs={epochs}",)
+    seconds = round(60 * minutes)
+    clock = f"00:{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}"
+    return (f"--trainer.max_time={clock}", "--trainer.max_epochs=-1")
+
+
 def call(log: Path, verb: str, *arguments: str, threads: int = 1) -> None:
     """Run a verb of this package with the present interpreter; its output is appended to the log.
 

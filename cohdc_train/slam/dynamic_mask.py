@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.culling import Mask, grow
-from cohdc_train.slam.geometry import Geometry, Reference
+from cohdc_train.slam.geometry import Comparison, Geometry, Reference
 from cohdc_train.slam.map import Keyframe
 from cohdc_train.slam.optimization import Array
 from cohdc_train.slam.surfaces import Movers
@@ -38,10 +38,13 @@ class DynamicMask:
         all_of_them = list({k.index: k for k in (*judges, *older)}.values())
         row = {k.index: i for i, k in enumerate(all_of_them)}
         comparison = self._geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
-        before = [row[k.index] for k in all_of_them if k.t <= t - _STOOD]
-        stood = comparison.only(before).still if before else np.ones(comparison.image.shape, dtype=np.bool_)
-        long_ago = comparison.only([row[k.index] for k in older])
-        found = self._geometry.movers(comparison.only([row[k.index] for k in judges]))
+
+        def against(keyframes: list[Keyframe]) -> Comparison:
+            return comparison.only([row[k.index] for k in keyframes])
+
+        before, long_ago = [k for k in all_of_them if k.t <= t - _STOOD], against(older)
+        stood = against(before).still if before else np.ones(comparison.image.shape, dtype=np.bool_)
+        found = self._geometry.movers(against(judges))
         masked = np.zeros_like(found) if mask is None else self._geometry.coarse(mask)
         found = self._movers.whole(t, found, stood, long_ago.still, comparison.image, masked)
         moves = grow(self._geometry.fine(found), _BAND)

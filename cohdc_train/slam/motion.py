@@ -18,6 +18,7 @@ SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
 _PAUSE = 10.0  # s, after which nothing more is forgotten
 _FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
+_NOTHING = np.zeros(6)
 _SURPRISE = 100.0  # squared standard deviations of a pose, from which on it is a leap
 
 
@@ -67,7 +68,7 @@ class Motion:
         """
         return Expectation(self._prior(t, self._predicted(t)), self._unrest < 1)
 
-    def found(self, t: float, T_cw: Array, information: Array, pull: Array | None = None) -> None:
+    def found(self, t: float, T_cw: Array, information: Array, pull: Array = _NOTHING) -> None:
         """The frame at t is at T_cw. information: [6, 6] of what it saw; pull: [6] `Prior.pull` of what was expected,
         where T_cw is a compromise with that."""
         seen = np.asarray(np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(_EXACT**2), dtype=np.float64)
@@ -87,15 +88,14 @@ class Motion:
         self._covariance = np.diag(np.concatenate([np.zeros(6), _UNKNOWN**2]))
         self._covariance[:6, :6] = seen
 
-    def _update(self, t: float, T_cw: Array, seen: Array, pull: Array | None) -> None:
+    def _update(self, t: float, T_cw: Array, seen: Array, pull: Array) -> None:
         assert self._t is not None
         covariance = self._predicted(t)
         expected = self._prior(t, covariance)
         self._step = t - self._t
         off = log_se3(T_cw @ inverse(expected.T_cw))
         spread = covariance[:6, :6] + seen
-        if pull is not None:
-            off = off + seen @ pull  # by how much it was before the compromise
+        off = off + seen @ pull  # by how much it was before the compromise
         inverted = np.linalg.inv(spread)
         surprise = float(off @ inverted @ off)
         self._unrest += _LEARNT * (min(surprise, _SURPRISE) / 6 - self._unrest)

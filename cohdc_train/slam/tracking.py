@@ -250,7 +250,7 @@ class Tracker:
             self._refiner.remember(keyframe, pyramid)
         self._since_keyframe = 0
         self._reference_inliers = 0
-        return replace(_fit_of(keyframe), information=fit.information)
+        return _fit_of(keyframe, fit.information)
 
     def _cull_keyframes(self) -> None:
         in_use = set() if self._mapper is None else self._mapper.busy_with
@@ -262,8 +262,7 @@ class Tracker:
     def _close_loop(self, fit: Fit, loops: LoopCloser, picture: Picture) -> Fit:
         """The newest keyframe's fit, after a loop where it is then."""
         keyframe = self.map.keyframes[-1]
-        closed = loops.close(keyframe, picture)
-        return replace(_fit_of(keyframe), information=fit.information) if closed else fit
+        return _fit_of(keyframe, fit.information) if loops.close(keyframe, picture) else fit
 
     def _remember(self, fit: Fit | None, t: float, matched: bool) -> None:
         if fit is None or fit.reference is None:
@@ -278,9 +277,9 @@ class Tracker:
         self._log.append(t, fit, fit.reference)
 
 
-def _fit_of(keyframe: Keyframe) -> Fit:
+def _fit_of(keyframe: Keyframe, information: Array) -> Fit:
     corners = np.flatnonzero(keyframe.point_ids >= 0)
-    return Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners), keyframe)
+    return Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners), keyframe, information)
 
 
 def _pose_of(fit: Fit | None, t: float, keyframe: bool, start: float, tracked: float) -> Pose:
