@@ -13,6 +13,7 @@ from cohdc_train.slam.optimization import inverse, to_local
 
 SCALE = 1.2  # between two levels of the image pyramid
 LEVELS = 8
+_PRECISE = 0.3  # px at its level: standard deviation of a corner that was moved to where its point's patch fits best
 _SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
 _CELL = 32  # px at the level of the corner
 _POOL = 2.0  # corners detected per corner kept: what the grid chooses from
@@ -30,6 +31,11 @@ class Corners:
     pixels: NDArray[np.float64]
     octaves: NDArray[np.int64]
     descriptors: NDArray[np.uint64]
+    precise: NDArray[np.bool_]
+
+    def take(self, rows: NDArray[np.int64]) -> "Corners":
+        """The chosen rows."""
+        return Corners(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.precise[rows])
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,8 @@ class Features:
     """n corners of one frame.
 
     pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n] int64 pyramid level;
-    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted.
+    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted;
+    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to (`refinement`).
     """
 
     pixels: NDArray[np.float64]
@@ -45,20 +52,31 @@ class Features:
     octaves: NDArray[np.int64]
     descriptors: NDArray[np.uint64]
     depths: NDArray[np.float64]
+    precise: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
         n = len(self.pixels)
-        shapes = (self.pixels.shape, self.points.shape, self.octaves.shape, self.descriptors.shape, self.depths.shape)
-        if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,)):
+        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.precise)
+        shapes = tuple(array.shape for array in arrays)
+        if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,), (n,)):
             raise ValueError(f"features disagree in shape: {shapes}")
 
     def __len__(self) -> int:
         return len(self.pixels)
 
+    def corners(self, rows: NDArray[np.int64]) -> Corners:
+        """The chosen rows, without what camera and depth said of them."""
+        return Corners(self.pixels, self.octaves, self.descriptors, self.precise).take(rows)
+
+    @property
+    def scales(self) -> NDArray[np.float64]:
+        """[n] px of the image per px of each corner's pyramid level."""
+        return np.asarray(SCALE**self.octaves, dtype=np.float64)
+
     @property
     def sigmas(self) -> NDArray[np.float64]:
         """[n] standard deviation of a corner's position, px: it grows with the pyramid level."""
-        return np.asarray(SCALE**self.octaves, dtype=np.float64)
+        return np.where(self.precise, _PRECISE, 1.0) * self.scales
 
 
 class FeatureExtractor:
@@ -96,7 +114,7 @@ class FeatureExtractor:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
         pixels += 0.5 * (_SCALES[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
-        return Corners(pixels, octaves, np.ascontiguousarray(words).view(np.uint64))
+        return Corners(pixels, octaves, np.ascontiguousarray(words).view(np.uint64), np.zeros(len(pixels), np.bool_))
 
     def measure(
         self,
@@ -111,7 +129,7 @@ class FeatureExtractor:
         depths = sample_depth(depth, pixels, mask)
         if lag is not None:
             depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
-        return Features(pixels, points, corners.octaves, corners.descriptors, depths)
+        return Features(pixels, points, corners.octaves, corners.descriptors, depths, corners.precise)
 
     def _caught_up(
         self,

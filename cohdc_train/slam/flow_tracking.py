@@ -5,7 +5,7 @@ are a few pixels on, and the patch around each says where. Flow starts from the 
 frame that was itself tracked by it, so that nothing adds up.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.features import Corners, Features, gray_of
-from cohdc_train.slam.localization import Fit
+from cohdc_train.slam.localization import Fit, known_by
 from cohdc_train.slam.map import Map
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.motion import Expectation
-from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
+from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, to_local
 
 _BETWEEN = 2  # frames in a row: ten times a second the map is consulted
 _WINDOW = (13, 13)  # px of a patch
@@ -72,7 +72,7 @@ class FlowTracker:
         if fit is None or len(fit.matches) < _LEAST:
             return
         rows = fit.matches.corners
-        corners = Corners(features.pixels[rows], features.octaves[rows], features.descriptors[rows])
+        corners = features.corners(rows)
         off = corners.pixels - self._seen_from(fit.T_cw, fit.matches.points)
         self._start = _Start(gray_of(rgb), corners, fit, off, _covered(corners.pixels, mask))
 
@@ -93,7 +93,7 @@ class FlowTracker:
         pixels = np.asarray(found, dtype=np.float64)
         rows = np.flatnonzero((status[:, 0] > 0) & _inside(pixels, self.map.camera))
         rows = rows[before.masked[rows] | ~_covered(pixels[rows], mask)]
-        corners = Corners(pixels[rows], before.corners.octaves[rows], before.corners.descriptors[rows])
+        corners = replace(before.corners.take(rows), pixels=pixels[rows])
         return Followed(before.fit.matches.points[rows], corners)
 
     def locate(self, followed: Followed, features: Features, expected: Expectation) -> Fit | None:
@@ -108,9 +108,8 @@ class FlowTracker:
         T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < least:
             return None
-        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
-        pull = np.zeros(6) if prior is None else prior.pull(T_cw)
-        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, information, pull)
+        known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
+        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, *known)
 
     def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
         """[m, 2] px as the lens shows them, of points of the map."""

@@ -10,7 +10,7 @@ from cohdc_train.slam.features import Features
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.motion import Expectation
-from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information
+from cohdc_train.slam.optimization import Array, Observations, Prior, Weighing, optimize_pose, pose_information
 from cohdc_train.slam.ransac import ransac_pose
 from cohdc_train.slam.rigidity import pose_of_rest
 
@@ -106,11 +106,27 @@ class Localizer:
             return None
         self.map.judge(matches.points[inlier], matches.points[moving])
         matches = matches.take(inlier)
-        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
-        pull = np.zeros(6) if prior is None else prior.pull(T_cw)
-        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], information, pull)
+        known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
+        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], *known)
+
+    def again(self, features: Features, fit: Fit, expected: Expectation | None) -> Fit:
+        """The pose of the same frame by corners that were moved since; what no longer fits stays matched."""
+        points, seen = self.map.measured(fit.matches, features)
+        prior = None if expected is None else expected.given(len(fit.matches))
+        T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._weighing, prior=prior)
+        if inlier.sum() < _MIN_TRACKED:
+            return fit
+        known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
+        return Fit(T_cw, fit.matches, fit.reference, *known)
+
+
+def known_by(
+    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, prior: Prior | None
+) -> tuple[Array, Array]:
+    """Information and pull of a `Fit` at T_cw [4, 4] to points [m, 3], of which the frame measured `seen`."""
+    return pose_information(T_cw, points, seen, weighing), np.zeros(6) if prior is None else prior.pull(T_cw)
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -46,7 +46,8 @@ class Keyframe:
 
 def observations(features: Features, corners: NDArray[np.int64], trust: Array | float = 1.0) -> Observations:
     """What a frame measured at some of its corners; trust: [n] weight of each, as Map.trust gives it."""
-    return Observations(features.points[corners], features.depths[corners], features.sigmas[corners] / np.sqrt(trust))
+    sigmas, depth_sigmas = features.sigmas[corners] / np.sqrt(trust), features.scales[corners] / np.sqrt(trust)
+    return Observations(features.points[corners], features.depths[corners], sigmas, depth_sigmas)
 
 
 class Map:
@@ -124,8 +125,9 @@ class Map:
         self.observe(keyframe, Matches(ids, corners))
 
     def observe(self, keyframe: Keyframe, matches: Matches) -> None:
-        """Corners of a keyframe, free so far, are measurements of points."""
+        """Corners of a keyframe, free so far, are measurements of points; their patches have not been held against it."""
         keyframe.point_ids[matches.corners] = matches.points
+        keyframe.features.precise[matches.corners] = False
         self._add_observer(matches.points, keyframe)
 
     def forget(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:

@@ -49,7 +49,7 @@ def match_projected(
     """
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    reach = radius * np.minimum(features.sigmas, _WIDEST)
+    reach = radius * np.minimum(features.scales, _WIDEST)
     i, j = _neighbours(projected, features, float(reach.max()))
     x, y = projected.pixels.T.take(i, axis=1) - features.points.T.take(j, axis=1)
     near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])

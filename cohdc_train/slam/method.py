@@ -20,7 +20,7 @@ class Method:
     """
 
     loops: bool = True
-    refinement: bool = False
+    refinement: bool = True
     geometry: bool = True
     static_weights: bool = True
     global_adjustment: bool = True

@@ -25,15 +25,18 @@ _NEAR = 0.05  # m: points nearer than this, or behind the camera, do not count
 
 @dataclass(frozen=True)
 class Observations:
-    """m measurements. pixels: [m, 2] undistorted px; depths: [m] m, nan = none; sigmas: [m] px."""
+    """m measurements. pixels: [m, 2] undistorted px; depths: [m] m, nan = none; sigmas, depth_sigmas: [m] px, of each
+    coordinate and of the disparity that depth stands for."""
 
     pixels: Array
     depths: Array
     sigmas: Array
+    depth_sigmas: Array
 
     def __post_init__(self) -> None:
         m = len(self.pixels)
-        if (self.pixels.shape, self.depths.shape, self.sigmas.shape) != ((m, 2), (m,), (m,)):
+        shapes = tuple(array.shape for array in (self.pixels, self.depths, self.sigmas, self.depth_sigmas))
+        if shapes != ((m, 2), (m,), (m,), (m,)):
             raise ValueError("observations disagree in shape")
 
     def __len__(self) -> int:
@@ -41,7 +44,7 @@ class Observations:
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Observations":
         """The chosen rows."""
-        return Observations(self.pixels[rows], self.depths[rows], self.sigmas[rows])
+        return Observations(self.pixels[rows], self.depths[rows], self.sigmas[rows], self.depth_sigmas[rows])
 
     @property
     def limits(self) -> Array:
@@ -127,7 +130,8 @@ def residuals(local: Array, seen: Observations, weighing: Weighing) -> Array:
     result[:, 1] = camera.fy * local[:, 1] / z + camera.cy - seen.pixels[:, 1]
     disparity = weighing.bf / z - weighing.bf / seen.depths
     result[:, 2] = np.where(np.isnan(disparity), 0.0, disparity)
-    result /= seen.sigmas[:, None]
+    result[:, :2] /= seen.sigmas[:, None]
+    result[:, 2] /= seen.depth_sigmas
     return result
 
 
@@ -141,7 +145,8 @@ def residual_jacobian(local: Array, seen: Observations, weighing: Weighing) -> A
     result[:, 1, 1] = camera.fy * reciprocal
     result[:, 1, 2] = -camera.fy * local[:, 1] * reciprocal**2
     result[:, 2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf * reciprocal**2)
-    result /= seen.sigmas[:, None, None]
+    result[:, :2] /= seen.sigmas[:, None, None]
+    result[:, 2] /= seen.depth_sigmas[:, None]
     return result
 
 
@@ -238,7 +243,7 @@ def _fill_pose_jacobian(J: Array, local: Array, seen: Observations, weighing: We
     J[0, 0] = camera.fx / (z * seen.sigmas)
     J[1, 1] = camera.fy / (z * seen.sigmas)
     J[2, 0], J[2, 1] = -u[0] * x / z, -v[1] * y / z
-    J[2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf / (z * z * seen.sigmas))
+    J[2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf / (z * z * seen.depth_sigmas))
     J[3] = y * J[2]  # a turn moves the point by phi x local
     J[3, 1] -= z * v[1]
     J[4] = -x * J[2]

@@ -18,6 +18,8 @@ from cohdc_train.slam.optimization import Array, to_local
 
 _STORED = 16  # px, side of a stored patch at its corner's level
 _SIDE = 8  # px, side of the part that is compared
+_COARSEST = 4  # level, beyond which a patch is so wide that it is seldom flat: points were drawn off by centimetres
+_AT_ONCE = 1024  # patches that are turned in one call
 _STEPS = 6
 _FURTHEST = 1.5  # px at the corner's level: what fits better further off is something else
 _DONE = 0.02  # px
@@ -33,27 +35,29 @@ class Pyramid:
     def __init__(self, gray: NDArray[np.uint8]) -> None:
         """gray: [H, W]."""
         height, width = gray.shape
-        self.levels = [gray]
+        levels = [gray]
         for level in range(1, LEVELS):
             size = (round(width / SCALE**level), round(height / SCALE**level))
-            smaller = cv2.resize(self.levels[-1], size, interpolation=cv2.INTER_LINEAR_EXACT)
-            self.levels.append(np.asarray(smaller, dtype=np.uint8))
+            smaller = cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR_EXACT)
+            levels.append(np.asarray(smaller, dtype=np.uint8))
+        self.levels: list[Floats] = [level.astype(np.float32) for level in levels]
 
-    def cut(self, pixels: Array, octaves: NDArray[np.int64], offsets: Array) -> Floats:
-        """Grey values around pixels [n, 2] px of level 0. offsets: [n, k, 2] or [k, 2] px of each one's own level.
+    def cut(self, pixels: Array, octaves: NDArray[np.int64], side: int, shift: Array | float = 0.0) -> Floats:
+        """Grey values of the square around each of pixels [n, 2] px of level 0. side, shift: [n, 2], px of each one's
+        own level.
 
-        Returns [n, k]; beyond the border the border's.
+        Returns [n, side * side], row by row; beyond the border the border's.
         """
-        offsets = np.broadcast_to(offsets, (len(pixels), *offsets.shape[-2:]))
-        result = np.empty(offsets.shape[:2], dtype=np.float32)
+        result = np.empty((len(pixels), side * side), dtype=np.float32)
         height, width = self.levels[0].shape
+        shift, (right, down) = np.broadcast_to(shift, pixels.shape), square(side)
         for level in np.unique(octaves).tolist():
             rows = np.flatnonzero(octaves == level)
             image = self.levels[level]
             share = np.array([image.shape[1] / width, image.shape[0] / height])
-            places = (((pixels[rows] + 0.5) * share - 0.5)[:, None] + offsets[rows]).astype(np.float32)
-            x, y = places[..., 0], places[..., 1]
-            result[rows] = cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            places = ((pixels[rows] + 0.5) * share - 0.5 + shift[rows]).astype(np.float32)
+            x, y = places[:, :1] + right, places[:, 1:] + down
+            result[rows] = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return result
 
 
@@ -73,15 +77,17 @@ class Refiner:
         if grown > 0:
             self._patches = np.concatenate([self._patches, np.zeros((grown, _STORED, _STORED), dtype=np.uint8)])
             self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
+        corners = np.flatnonzero((keyframe.point_ids >= 0) & (keyframe.features.octaves <= _COARSEST))
         corners = corners[self.world.born[keyframe.point_ids[corners]] == keyframe.index]
         ids, octaves = keyframe.point_ids[corners], keyframe.features.octaves[corners]
-        patches = pyramid.cut(keyframe.features.pixels[corners], octaves, square(_STORED))
+        patches = pyramid.cut(keyframe.features.pixels[corners], octaves, _STORED)
         self._patches[ids] = np.rint(patches).reshape(-1, _STORED, _STORED)
         self._octaves[ids] = octaves
+        keyframe.features.precise[corners] = True  # where the patch lies, by which others are moved
 
     def refine(self, features: Features, matches: Matches, T_cw: Array, pyramid: Pyramid) -> Features:
         """The features with those matched corners moved that found a better place. T_cw: [4, 4] the frame's pose."""
+        matches = matches.take(features.octaves[matches.corners] <= _COARSEST)
         if len(matches) == 0:
             return features
         ids, corners = matches.points, matches.corners
@@ -95,14 +101,15 @@ class Refiner:
         pixels[rows] += shift[good] * SCALE ** octaves[good, None]
         undistort = self.world.camera.undistort  # the difference, for points may be unrolled (`shutter`)
         points[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
-        return replace(features, pixels=pixels, points=points)
+        precise = np.zeros(len(features), dtype=np.bool_)
+        precise[rows] = True
+        return replace(features, pixels=pixels, points=points, precise=precise)
 
 
-def square(side: int) -> Array:
-    """[side * side, 2] offsets (x, y) of a square's pixels from its middle, px, row by row."""
-    places = np.arange(side) - (side - 1) / 2
-    x, y = np.meshgrid(places, places)
-    return np.stack([x.ravel(), y.ravel()], axis=1)
+def square(side: int) -> Floats:
+    """[2, side * side] offsets x and y of a square's pixels from its middle, px, row by row."""
+    places = np.arange(side, dtype=np.float32) - (side - 1) / 2
+    return np.stack([np.tile(places, side), np.repeat(places, side)])
 
 
 def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
@@ -121,15 +128,15 @@ def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
 
 def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
     """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image, at their levels."""
-    places = np.einsum("nij,kj->nki", inverse, square(side)) + (_STORED - 1) / 2
-    places = np.clip(places, 0, _STORED - 1.001)
-    whole = np.floor(places).astype(np.int64)
-    x, y = whole[..., 0], whole[..., 1]
-    a, b = np.moveaxis((places - whole).astype(np.float32), -1, 0)
-    rows, grey = np.arange(len(patches))[:, None], patches.astype(np.float32)
-    upper = grey[rows, y, x] * (1 - a) + grey[rows, y, x + 1] * a
-    lower = grey[rows, y + 1, x] * (1 - a) + grey[rows, y + 1, x + 1] * a
-    return np.asarray(upper * (1 - b) + lower * b, dtype=np.float32).reshape(-1, side, side)
+    result = np.empty((len(patches), side * side), dtype=np.float32)
+    for start in range(0, len(patches), _AT_ONCE):
+        some = slice(start, start + _AT_ONCE)
+        column = patches[some].reshape(-1, _STORED).astype(np.float32)  # one patch below the other
+        places = inverse[some].astype(np.float32) @ square(side) + np.float32((_STORED - 1) / 2)
+        x, y = np.clip(places, 0, _STORED - 1).transpose(1, 0, 2)
+        y += _STORED * np.arange(len(y), dtype=np.float32)[:, None]
+        result[some] = cv2.remap(column, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return result.reshape(-1, side, side)
 
 
 def align(
@@ -147,21 +154,28 @@ def align(
     dx = _centred(0.5 * (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]))
     dy = _centred(0.5 * (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]))
     gradient = np.stack([dx, dy], axis=1)  # [n, 2, k]
-    H = gradient @ gradient.transpose(0, 2, 1)
-    active = np.linalg.eigvalsh(H)[:, 0] > _TEXTURE
-    descent = np.linalg.inv(H + 1e-3 * np.eye(2)) @ gradient
-    shift, likeness, offsets = np.zeros((n, 2)), np.zeros(n), square(template.shape[1] - 2)
+    H = gradient @ gradient.transpose(0, 2, 1) + np.float32(1e-3) * np.eye(2, dtype=np.float32)
+    active = _least_eigenvalue(H) > _TEXTURE
+    descent = np.linalg.inv(H) @ gradient
+    shift, likeness, side = np.zeros((n, 2)), np.zeros(n), template.shape[1] - 2
     for _ in range(_STEPS):
         rows = np.flatnonzero(active)
         if len(rows) == 0:
             break
-        seen = _centred(pyramid.cut(pixels[rows], octaves[rows], offsets + shift[rows, None]))
+        seen = _centred(pyramid.cut(pixels[rows], octaves[rows], side, shift[rows]))
+        wanted = inner[rows]
         seen *= contrast[rows] / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-6)
-        likeness[rows] = (seen * inner[rows]).sum(axis=1) / contrast[rows, 0] ** 2
-        step = -np.einsum("nik,nk->ni", descent[rows], seen - inner[rows])
+        likeness[rows] = np.einsum("nk,nk->n", seen, wanted) / contrast[rows, 0] ** 2
+        step = (descent[rows] @ (wanted - seen)[..., None])[..., 0]
         shift[rows] += step
         active[rows] = np.abs(step).max(axis=1) > _DONE
     return shift, (likeness >= _LIKENESS) & (np.linalg.norm(shift, axis=1) <= _FURTHEST)
+
+
+def _least_eigenvalue(H: Floats) -> Floats:
+    """[n] of symmetric matrices [n, 2, 2]."""
+    mean, half = (H[:, 0, 0] + H[:, 1, 1]) / 2, (H[:, 0, 0] - H[:, 1, 1]) / 2
+    return np.asarray(mean - np.hypot(half, H[:, 0, 1]), dtype=np.float32)
 
 
 def _centred(patches: Floats) -> Floats:

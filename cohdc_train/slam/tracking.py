@@ -122,6 +122,11 @@ class Tracker:
         if covered:
             features = self._corners(rgb, depth_m, None, late)
             fit = self._locate(features, rgb, expected)
+        pyramid = None
+        if self._refiner is not None and fit is not None:
+            pyramid = Pyramid(gray_of(rgb))
+            features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
+            fit = self._localizer.again(features, fit, expected) if fit.reference is not None else fit
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
@@ -129,7 +134,7 @@ class Tracker:
             self._motion.found(t, fit.T_cw, fit.information, fit.pull)
         if fit is not None and keyframe:
             before = fit.T_cw
-            fit = self._add_keyframe(features, fit, t, rgb, depth_m)
+            fit = self._add_keyframe(features, fit, t, rgb, depth_m, pyramid)
             if self._loops is not None:
                 fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
             if self.method.keyframe_culling:
@@ -236,11 +241,14 @@ class Tracker:
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
     def _add_keyframe(
-        self, features: Features, fit: Fit, t: float, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
+        self,
+        features: Features,
+        fit: Fit,
+        t: float,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        pyramid: Pyramid | None,
     ) -> Fit:
-        pyramid = Pyramid(gray_of(rgb)) if self._refiner else None
-        if self._refiner is not None and pyramid is not None:
-            features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
         pictures = thumbnail(rgb), self._geometry.nearest(depth_m)

@@ -68,6 +68,7 @@ def _window(world: Map, keyframes: list[Keyframe], fixed: int) -> Window:
             np.concatenate([s.pixels for s in seen]),
             np.concatenate([s.depths for s in seen]),
             np.concatenate([s.sigmas for s in seen]),
+            np.concatenate([s.depth_sigmas for s in seen]),
         ),
         free=np.arange(len(keyframes)) >= fixed,
     )

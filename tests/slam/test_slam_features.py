@@ -72,7 +72,14 @@ def test_hamming_counts_bits() -> None:
 
 def test_features_cannot_disagree_in_shape() -> None:
     with pytest.raises(ValueError, match="disagree"):
-        Features(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(3, int), np.zeros((2, 4), np.uint64), np.zeros(2))
+        Features(
+            np.zeros((2, 2)),
+            np.zeros((2, 2)),
+            np.zeros(3, int),
+            np.zeros((2, 4), np.uint64),
+            np.zeros(2),
+            np.zeros(2, bool),
+        )
 
 
 def detections(*rows: tuple[tuple[float, float, float, float], int, float, float]) -> Detections:

@@ -28,8 +28,8 @@ def views() -> list[View]:
 
 
 def run(views: list[View], loops: bool) -> Run:
-    """And all the while the motion starts from where the latest frame is, after a loop too."""
-    tracker, poses = Tracker(CAMERA, features=250, method=Method(loops=loops)), []
+    """With corners on whole pixels, or it would not drift; the motion always starts from the latest frame's pose."""
+    tracker, poses = Tracker(CAMERA, features=250, method=Method(loops=loops, refinement=False)), []
     for index, (rgb, depth) in enumerate(views):
         poses.append(tracker.track(rgb, depth, index / 30))
         assert tracker._last is not None

@@ -153,7 +153,7 @@ def world(count: int, spread: float) -> tuple[NDArray[np.float64], Observations]
     depths = rng.uniform(2, 3, count)
     points = CAMERA.backproject(pixels, depths)
     noisy = pixels + rng.normal(0, 1, pixels.shape)
-    return points, Observations(noisy, depths * (1 + rng.normal(0, 0.02, count)), np.ones(count))
+    return points, Observations(noisy, depths * (1 + rng.normal(0, 0.02, count)), np.ones(count), np.ones(count))
 
 
 def test_an_expectation_decides_where_little_is_seen_and_only_there() -> None:
@@ -195,9 +195,9 @@ def test_information_says_how_poses_scatter() -> None:
     steps = []
     for _ in range(300):
         disparity = true.bf / depths + rng.normal(0, 1, 60)
-        seen = Observations(pixels + rng.normal(0, 1, (60, 2)), true.bf / disparity, np.ones(60))
+        seen = Observations(pixels + rng.normal(0, 1, (60, 2)), true.bf / disparity, np.ones(60), np.ones(60))
         steps.append(log_se3(optimize_pose(np.eye(4), points, seen, true)[0]))
-    exact = Observations(pixels, depths, np.ones(60))
+    exact = Observations(pixels, depths, np.ones(60), np.ones(60))
     foreseen = np.sqrt(np.diag(np.linalg.inv(pose_information(np.eye(4), points, exact, true))))
     np.testing.assert_allclose(np.std(steps, axis=0), foreseen, rtol=0.2)
 
@@ -210,7 +210,7 @@ def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(monkeypatch: pytes
     errors = {}
     for few in (0, motion_module._FEW):
         monkeypatch.setattr(motion_module, "_FEW", few)
-        tracker = Tracker(CAMERA, features=200, method=Method(smoothing=False))
+        tracker = Tracker(CAMERA, features=200, method=Method(smoothing=False, refinement=False))
         poses = [
             tracker.track(rgb, depth, k / 30, almost_all if k >= 10 else None)
             for k, (rgb, depth, _) in enumerate(views)

@@ -154,7 +154,7 @@ def scene(seed: int, shift: float) -> tuple[Array, Observations, NDArray[np.bool
     local = points + cart[:, None] * np.array([shift, 0, 0])
     pixels = CAMERA.project(local) + rng.normal(0, 0.5, (340, 2))
     depths = local[:, 2] + rng.normal(0, 0.003, 340) * local[:, 2] ** 2
-    return points, Observations(pixels, depths, np.ones(340)), cart
+    return points, Observations(pixels, depths, np.ones(340), np.ones(340)), cart
 
 
 def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
@@ -209,7 +209,7 @@ def test_of_two_groups_the_one_that_is_long_known_is_the_world(seed: int, shift:
     points, walks = np.concatenate([wall, person]), np.arange(400) >= 100
     local = points + walks[:, None] * np.array([shift, 0, 0])
     pixels = CAMERA.project(local) + rng.normal(0, 0.5, (400, 2))
-    seen = Observations(pixels, local[:, 2] + rng.normal(0, 0.003, 400) * local[:, 2] ** 2, np.ones(400))
+    seen = Observations(pixels, local[:, 2] + rng.normal(0, 0.003, 400) * local[:, 2] ** 2, np.ones(400), np.ones(400))
     dragged, _ = optimize_pose(STILL, points, seen, WEIGHING)
     assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift, "most points are the person's"
     pose, _, moving = pose_of_rest(STILL, points, seen, WEIGHING, np.where(walks, 5, 100))

@@ -40,7 +40,8 @@ def observe(T_cw: Array, points: Array, rng: np.random.Generator, noise: float =
     pixels = CAMERA.project(local) + rng.normal(size=(len(points), 2)) * noise
     depths = WEIGHING.bf / (WEIGHING.bf / local[:, 2] + rng.normal(size=len(points)) * noise)
     depths[rng.random(len(points)) < 0.2] = np.nan
-    return Observations(pixels, depths, rng.choice([1.0, 1.2, 1.44], size=len(points)))
+    sigmas = rng.choice([[1.0, 1.0], [1.2, 1.2], [1.44, 1.44], [0.8, 1.2]], size=len(points)).T
+    return Observations(pixels, depths, *sigmas)
 
 
 @given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
@@ -87,7 +88,7 @@ def test_pose_is_found_and_outliers_are_told() -> None:
 
 def test_a_point_behind_the_camera_is_never_an_inlier() -> None:
     points = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
-    seen = Observations(np.full((2, 2), [CAMERA.cx, CAMERA.cy]), np.full(2, np.nan), np.ones(2))
+    seen = Observations(np.full((2, 2), [CAMERA.cx, CAMERA.cy]), np.full(2, np.nan), np.ones(2), np.ones(2))
     np.testing.assert_array_equal(chi_square(np.eye(4), points, seen, WEIGHING) < CHI2_DEPTH, [False, True])
 
 
@@ -115,7 +116,7 @@ def test_ransac_survives_sixty_percent_outliers() -> None:
 def test_ransac_without_depth_falls_back_on_the_guess() -> None:
     rng = np.random.default_rng(3)
     points = cloud(rng, 20)
-    seen = Observations(CAMERA.project(points), np.full(20, np.nan), np.ones(20))
+    seen = Observations(CAMERA.project(points), np.full(20, np.nan), np.ones(20), np.ones(20))
     assert ransac_pose(points, seen, CAMERA, rng) is None
     found = ransac_pose(points, seen, CAMERA, rng, guess=np.eye(4))
     assert found is not None
@@ -132,6 +133,7 @@ def small_problem(seed: int, outliers: int = 0) -> tuple[Array, Array, Array, Ar
         np.concatenate([s.pixels for s in seen]),
         np.concatenate([s.depths for s in seen]),
         np.concatenate([s.sigmas for s in seen]),
+        np.concatenate([s.depth_sigmas for s in seen]),
     )
     everything.pixels[:outliers] += 60.0
     free = np.array([False, False, True, True, True])
@@ -183,6 +185,6 @@ def test_the_cost_never_rises_from_a_bad_start() -> None:
 
 
 def test_a_problem_refuses_unsorted_cameras() -> None:
-    seen = Observations(np.zeros((2, 2)), np.zeros(2), np.ones(2))
+    seen = Observations(np.zeros((2, 2)), np.zeros(2), np.ones(2), np.ones(2))
     with pytest.raises(ValueError, match="sorted by camera"):
         Problem(np.array([1, 0]), np.array([0, 0]), seen, np.array([True, True]))

@@ -25,7 +25,7 @@ def seen(points: Array, twist: Array) -> Features:
         pixels = CAMERA.project(local)
         late = ROLLING.readout * (pixels[:, 1] / CAMERA.height - 0.5)
     none = np.zeros(len(points), dtype=np.int64)
-    return Features(pixels, pixels, none, np.zeros((len(points), 4), dtype=np.uint64), local[:, 2])
+    return Features(pixels, pixels, none, np.zeros((len(points), 4), dtype=np.uint64), local[:, 2], none > 0)
 
 
 @given(speeds)

@@ -149,7 +149,7 @@ def features_at(points: list[tuple[float, float]], words: list[int], octaves: li
     pixels = np.array(points, dtype=np.float64)
     descriptors = np.zeros((len(words), 4), dtype=np.uint64)
     descriptors[:, 0] = words
-    return Features(pixels, pixels, np.array(octaves), descriptors, np.ones(len(words)))
+    return Features(pixels, pixels, np.array(octaves), descriptors, np.ones(len(words)), np.zeros(len(words), bool))
 
 
 @pytest.mark.parametrize(
