@@ -1,7 +1,7 @@
 """ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that can be trusted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import cv2
@@ -67,6 +67,11 @@ class Features:
     def corners(self, rows: NDArray[np.int64]) -> Corners:
         """The chosen rows, without what camera and depth said of them."""
         return Corners(self.pixels, self.octaves, self.descriptors, self.precise).take(rows)
+
+    @property
+    def for_others(self) -> "Features":
+        """The same corners as measurements of other points than those by whose patches they are precise."""
+        return replace(self, precise=np.zeros_like(self.precise))
 
     @property
     def scales(self) -> NDArray[np.float64]:

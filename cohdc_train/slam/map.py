@@ -125,7 +125,7 @@ class Map:
         self.observe(keyframe, Matches(ids, corners))
 
     def observe(self, keyframe: Keyframe, matches: Matches) -> None:
-        """Corners of a keyframe, free so far, are measurements of points; their patches have not been held against it."""
+        """Corners of a keyframe, free so far, are measurements of points, held against none of their patches."""
         keyframe.point_ids[matches.corners] = matches.points
         keyframe.features.precise[matches.corners] = False
         self._add_observer(matches.points, keyframe)

@@ -122,11 +122,10 @@ class Tracker:
         if covered:
             features = self._corners(rgb, depth_m, None, late)
             fit = self._locate(features, rgb, expected)
-        pyramid = None
-        if self._refiner is not None and fit is not None:
-            pyramid = Pyramid(gray_of(rgb))
+        pyramid = None if self._refiner is None or fit is None else Pyramid(gray_of(rgb))
+        if self._refiner is not None and fit is not None and fit.reference is not None and pyramid is not None:
             features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
-            fit = self._localizer.again(features, fit, expected) if fit.reference is not None else fit
+            fit = self._localizer.again(features, fit, expected)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)

@@ -67,7 +67,7 @@ class Verifier:
     def _locate(self, keyframe: Keyframe, ids: NDArray[np.int64], place: NDArray[np.int64]) -> Array | None:
         """T_cw of a keyframe as if nothing were known about where it is: from points `ids` of an old place by their
         descriptors, then from all its points."""
-        world, features = self._world, keyframe.features
+        world, features = self._world, keyframe.features.for_others
         rough = self._ransac(keyframe, match_descriptors(ids, world.descriptors[ids], features))
         if rough is None:
             return None
@@ -80,7 +80,10 @@ class Verifier:
         return T_cw if inliers >= _MIN_INLIERS else None
 
     def _ransac(self, keyframe: Keyframe, matches: Matches) -> Array | None:
-        points, seen = self._world.positions[matches.points], observations(keyframe.features, matches.corners)
+        points, seen = (
+            self._world.positions[matches.points],
+            observations(keyframe.features.for_others, matches.corners),
+        )
         if len(matches) < _MIN_ROUGH:
             return None
         found = ransac_pose(points, seen, self._world.camera, self._rng, _HYPOTHESES)
