@@ -9,7 +9,8 @@ class Method:
 
     Args:
         loops: a place seen before is recognised, checked and closed by a pose graph (paper 2.3, eqs. 10-12).
-        refinement: a keyframe's measurements move to where the points' patches fit best (paper eqs. 8 and 9).
+        refinement: matched corners move to where their points' patches fit best (paper eqs. 8 and 9), and count for the
+            fraction of a pixel to which they are then known.
         geometry: what stands where a keyframe looked through moves, whatever its class; nothing is taken from there. A
             masked thing that has stood still for two seconds is of use until it moves.
         static_weights: groups of points that do not move with the rest are left out, and count less from then on.

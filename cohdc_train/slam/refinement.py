@@ -1,8 +1,9 @@
-"""Photometric refinement: a keyframe's measurement moves to where the point's patch fits best (paper eqs. 8 and 9).
+"""Photometric refinement: a measurement moves to where the point's patch fits best (paper eqs. 8 and 9).
 
 A corner of ORB lies on a whole pixel of its pyramid level. The patch that was cut out where the point was first seen,
-turned and scaled as the camera has moved since, says where in the image the point is to a fraction of that. We depart
-from eq. 9 in that A has four free entries: the patch is taken for a plane that faced the first camera.
+turned and scaled as the camera has moved since, says where in the image the point is to a fraction of that. Such
+measurements are `precise` and weigh accordingly, in a frame's pose as in bundle adjustment. We depart from eq. 9 in
+that A has four free entries: the patch is taken for a plane that faced the first camera.
 """
 
 from dataclasses import dataclass, replace
@@ -20,9 +21,9 @@ _STORED = 16  # px, side of a stored patch at its corner's level
 _SIDE = 8  # px, side of the part that is compared
 _COARSEST = 4  # level, beyond which a patch is so wide that it is seldom flat: points were drawn off by centimetres
 _AT_ONCE = 1024  # patches that are turned in one call
-_STEPS = 6
+_STEPS = 3  # what is left after them is a hundredth of a pixel
 _FURTHEST = 1.5  # px at the corner's level: what fits better further off is something else
-_DONE = 0.02  # px
+_DONE = 0.03  # px
 _LIKENESS = 0.8  # least normalised correlation of patch and image
 _TEXTURE = 400.0  # least eigenvalue of the patch's gradients, squared grey values
 
