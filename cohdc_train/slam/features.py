@@ -80,7 +80,7 @@ class Features:
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
-        """[n] standard deviation of a corner's position, px: it grows with the pyramid level."""
+        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less where precise."""
         return np.where(self.precise, _PRECISE, 1.0) * self.scales
 
 

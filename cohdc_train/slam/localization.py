@@ -111,13 +111,15 @@ class Localizer:
         known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
         return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], *known)
 
-    def again(self, features: Features, fit: Fit, expected: Expectation | None) -> Fit:
-        """The pose of the same frame by corners that were moved since; what no longer fits stays matched."""
+    def again(self, features: Features, fit: Fit, expected: Expectation | None) -> Fit | None:
+        """The pose of the same frame by corners that were moved since; what no longer fits stays matched. None where
+        hardly anything fits. What was expected counts if it did the first time: a place found anew speaks against it.
+        """
         points, seen = self.map.measured(fit.matches, features)
-        prior = None if expected is None else expected.given(len(fit.matches))
+        prior = expected.prior if expected is not None and fit.pull.any() else None
         T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < _MIN_TRACKED:
-            return fit
+            return None
         known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
         return Fit(T_cw, fit.matches, fit.reference, *known)
 

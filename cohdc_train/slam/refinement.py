@@ -44,8 +44,8 @@ class Pyramid:
         self.levels: list[Floats] = [level.astype(np.float32) for level in levels]
 
     def cut(self, pixels: Array, octaves: NDArray[np.int64], side: int, shift: Array | float = 0.0) -> Floats:
-        """Grey values of the square around each of pixels [n, 2] px of level 0. side, shift: [n, 2], px of each one's
-        own level.
+        """Grey values of the square around each of pixels [n, 2] px of level 0. side, and shift [n, 2]: px of each
+        one's own level.
 
         Returns [n, side * side], row by row; beyond the border the border's.
         """
@@ -64,7 +64,7 @@ class Pyramid:
 
 @dataclass
 class Refiner:
-    """Keeps the patch of every point of a map, and moves measurements by them."""
+    """Keeps the patches of a map's points, of all but the coarsest corners, and moves measurements by them."""
 
     world: Map
 
@@ -73,11 +73,13 @@ class Refiner:
         self._octaves = np.zeros(0, dtype=np.int64)
 
     def remember(self, keyframe: Keyframe, pyramid: Pyramid) -> None:
-        """Cut out the points that were born in a keyframe, which must be in the map."""
+        """Cut out the points that were born in a keyframe, the newest in the map."""
         grown = len(self.world.positions) - len(self._patches)  # the map doubles its arrays, so this is rarely copied
         if grown > 0:
             self._patches = np.concatenate([self._patches, np.zeros((grown, _STORED, _STORED), dtype=np.uint8)])
             self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
+        born = np.flatnonzero(self.world.born[: len(self._patches)] == keyframe.index)
+        self._patches[born] = 0  # blank, or a point without one would have that of the point whose row it took
         corners = np.flatnonzero((keyframe.point_ids >= 0) & (keyframe.features.octaves <= _COARSEST))
         corners = corners[self.world.born[keyframe.point_ids[corners]] == keyframe.index]
         ids, octaves = keyframe.point_ids[corners], keyframe.features.octaves[corners]
@@ -155,9 +157,9 @@ def align(
     dx = _centred(0.5 * (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]))
     dy = _centred(0.5 * (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]))
     gradient = np.stack([dx, dy], axis=1)  # [n, 2, k]
-    H = gradient @ gradient.transpose(0, 2, 1) + np.float32(1e-3) * np.eye(2, dtype=np.float32)
+    H = (gradient @ gradient.transpose(0, 2, 1)).astype(np.float64) + 1e-3 * np.eye(2)
     active = _least_eigenvalue(H) > _TEXTURE
-    descent = np.linalg.inv(H) @ gradient
+    descent = np.linalg.inv(H).astype(np.float32) @ gradient
     shift, likeness, side = np.zeros((n, 2)), np.zeros(n), template.shape[1] - 2
     for _ in range(_STEPS):
         rows = np.flatnonzero(active)
@@ -173,10 +175,10 @@ def align(
     return shift, (likeness >= _LIKENESS) & (np.linalg.norm(shift, axis=1) <= _FURTHEST)
 
 
-def _least_eigenvalue(H: Floats) -> Floats:
+def _least_eigenvalue(H: Array) -> Array:
     """[n] of symmetric matrices [n, 2, 2]."""
     mean, half = (H[:, 0, 0] + H[:, 1, 1]) / 2, (H[:, 0, 0] - H[:, 1, 1]) / 2
-    return np.asarray(mean - np.hypot(half, H[:, 0, 1]), dtype=np.float32)
+    return np.asarray(mean - np.hypot(half, H[:, 0, 1]))
 
 
 def _centred(patches: Floats) -> Floats:

@@ -124,8 +124,9 @@ class Tracker:
             fit = self._locate(features, rgb, expected)
         pyramid = None if self._refiner is None or fit is None else Pyramid(gray_of(rgb))
         if self._refiner is not None and fit is not None and fit.reference is not None and pyramid is not None:
-            features = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
-            fit = self._localizer.again(features, fit, expected)
+            refined = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
+            again = self._localizer.again(refined, fit, expected)
+            features, fit = (features, fit) if again is None else (refined, again)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.alignment import Picture, align
+from cohdc_train.slam.features import Features
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.optimization import Array, Weighing, inverse, optimize_pose
@@ -68,7 +69,7 @@ class Verifier:
         """T_cw of a keyframe as if nothing were known about where it is: from points `ids` of an old place by their
         descriptors, then from all its points."""
         world, features = self._world, keyframe.features.for_others
-        rough = self._ransac(keyframe, match_descriptors(ids, world.descriptors[ids], features))
+        rough = self._ransac(features, match_descriptors(ids, world.descriptors[ids], features))
         if rough is None:
             return None
         T_cw, inliers = rough, 0
@@ -79,11 +80,8 @@ class Verifier:
             inliers = int(inlier.sum())
         return T_cw if inliers >= _MIN_INLIERS else None
 
-    def _ransac(self, keyframe: Keyframe, matches: Matches) -> Array | None:
-        points, seen = (
-            self._world.positions[matches.points],
-            observations(keyframe.features.for_others, matches.corners),
-        )
+    def _ransac(self, features: Features, matches: Matches) -> Array | None:
+        points, seen = self._world.positions[matches.points], observations(features, matches.corners)
         if len(matches) < _MIN_ROUGH:
             return None
         found = ransac_pose(points, seen, self._world.camera, self._rng, _HYPOTHESES)

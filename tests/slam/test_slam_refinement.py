@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
 from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.map import observations
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Array, exp_se3, inverse, to_local
@@ -50,7 +51,7 @@ def test_a_patch_is_turned_and_scaled() -> None:
     np.testing.assert_allclose(warped(ramp, 0.5 * np.eye(2)[None], 8)[0, 0], 75 + 5 * (np.arange(8) - 3.5), atol=1e-3)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def tracker() -> Tracker:
     """One keyframe of a wall that faces it."""
     tracker = Tracker(CAMERA, features=200)
@@ -94,6 +95,47 @@ def test_what_a_rolling_shutter_moved_stays_moved(tracker: Tracker) -> None:
     np.testing.assert_allclose(refined[1] - refined[0], 3.0)
 
 
+def test_what_fits_nowhere_is_not_precise(tracker: Tracker) -> None:
+    """The same corners where the picture shows something else: none counts for more than it did."""
+    keyframe = tracker.map.keyframes[0]
+    corners = np.flatnonzero(keyframe.point_ids >= 0)
+    matches, refiner = Matches(keyframe.point_ids[corners], corners), tracker._refiner
+    assert refiner is not None
+    for picture, least, most in ((FIRST_VIEW, 0.5, 1.0), (np.ascontiguousarray(FIRST_VIEW[::-1]), 0.0, 0.05)):
+        pyramid = Pyramid(np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8))
+        found = refiner.refine(keyframe.features, matches, keyframe.T_cw, pyramid)
+        assert least <= found.precise.mean() <= most
+        np.testing.assert_array_equal(found.pixels[~found.precise], keyframe.features.pixels[~found.precise])
+
+
+def test_a_point_without_a_patch_does_not_take_over_a_former_one(tracker: Tracker) -> None:
+    world, refiner = tracker.map, tracker._refiner
+    assert refiner is not None
+    wide = world.keyframes[0].features.octaves > 4
+    ids = world.keyframes[0].point_ids
+    refiner._patches[:] = 77  # of points that once had these rows
+    refiner.remember(world.keyframes[0], Pyramid(np.asarray(cv2.cvtColor(FIRST_VIEW, cv2.COLOR_RGB2GRAY), np.uint8)))
+    assert (refiner._patches[ids[wide & (ids >= 0)]] == 0).all()
+    assert refiner._patches[ids[~wide & (ids >= 0)]].std() > 10
+
+
+def test_a_patch_with_one_edge_is_no_error() -> None:
+    x, y = np.meshgrid(np.arange(10), np.arange(10))
+    edge = np.where(x + y > 9, 200, 20).astype(np.float32)[None]
+    assert not align(PYRAMID, CORNERS.pixels[:1], CORNERS.octaves[:1], edge)[1].any()
+
+
+def test_a_place_found_anew_owes_nothing_to_where_it_was_expected() -> None:
+    """A camera at rest that is carried off at once: what it sees, some hundred points, says where it is."""
+    tracker = Tracker(CAMERA, features=150, method=Method(loops=False, keyframe_culling=False))
+    yaws = [*np.linspace(0, 0.55, 28), *([0.55] * 12)]
+    path = [exp_se3(np.array([0, 0, 0, 0, yaw, 0])) for yaw in yaws] + [exp_se3(np.array([0.1, 0, 0, 0, 0.05, 0]))]
+    poses = [tracker.track(*render(room(), T_wc)[:2], k / 30) for k, T_wc in enumerate(path)]
+    assert poses[-1].T_wc is not None
+    assert poses[-1].inliers < 150
+    assert np.linalg.norm(poses[-1].T_wc[:3, 3] - path[-1][:3, 3]) < 0.02
+
+
 def test_a_map_of_refined_measurements_fits_better() -> None:
     """Twelve views of a room: what bundle adjustment leaves over, in the median, falls by a fifth and more."""
     left = []
@@ -133,6 +175,14 @@ def test_only_what_a_patch_was_held_against_is_precise(tracker: Tracker) -> None
     assert keyframe.features.precise[points].all()
     assert (keyframe.features.sigmas[points] < 0.5 * keyframe.features.scales[points]).all()
     assert not keyframe.features.precise[~points].any(), "wide patches are seldom flat"
+    measured = observations(keyframe.features, np.arange(len(points)))
+    np.testing.assert_array_equal(measured.sigmas, keyframe.features.sigmas)
+    np.testing.assert_array_equal(measured.depth_sigmas, keyframe.features.scales, err_msg="depth is no better known")
+    others = keyframe.features.for_others
+    np.testing.assert_array_equal(
+        others.sigmas, keyframe.features.scales, err_msg="of other points nothing more is known"
+    )
+    assert keyframe.features.precise[points].all()
     matches = Matches(keyframe.point_ids[points][:1], np.flatnonzero(points)[:1])
     tracker.map.forget(keyframe, matches.corners)
     tracker.map.observe(keyframe, matches)
