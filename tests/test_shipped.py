@@ -1,4 +1,4 @@
-"""The network that comes with the package: named, small, described by its card, and it finds people."""
+"""The networks that come with the package: named, small, described by their cards, and they find people."""
 
 import json
 import re
@@ -14,15 +14,14 @@ from cohdc_train.segmenter import Segmenter
 
 ROOT = Path(__file__).resolve().parents[1]
 PHOTOS = ROOT.parent / "shared" / "data" / "samples" / "walking_xyz_rgb"
-CARD = (ROOT / "cohdc_train" / "shipped" / "person.md").read_text(encoding="utf-8")
-STORED = json.loads((ROOT / "docs" / "results" / "person" / "n.json").read_text())
+CANVASES = {"person": (480, 640), "person_s": (640, 864)}
 
 
 def test_a_name_means_the_shipped_file_unless_there_is_a_file_of_that_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert shipped_models() == ["person"]
+    assert shipped_models() == ["person", "person_s"]
     shipped = model_path("person")
     assert shipped.name == "person.onnx"
     assert shipped.is_file()
@@ -32,28 +31,33 @@ def test_a_name_means_the_shipped_file_unless_there_is_a_file_of_that_name(
     assert model_path("person") == Path("person")
 
 
-def test_it_keeps_the_contract_and_is_small() -> None:
-    segmenter = Segmenter(Path("person"), threads=1)
+@pytest.mark.parametrize(("name", "canvas"), CANVASES.items())
+def test_it_keeps_the_contract_and_is_small(name: str, canvas: tuple[int, int]) -> None:
+    segmenter = Segmenter(Path(name), threads=1)
     assert segmenter.class_names == ("person",)
-    assert segmenter.canvas == (480, 640)
-    assert model_path("person").stat().st_size < 10e6
+    assert segmenter.canvas == canvas
+    assert model_path(name).stat().st_size < 10e6
     assert len(segmenter(np.zeros((480, 640, 3), np.uint8))) == 0
 
 
-def test_the_card_tells_the_stored_figures() -> None:
-    rows = dict(re.findall(r"^\| (.+?) \| ([\d.]+) \|", CARD, flags=re.MULTILINE))
+@pytest.mark.parametrize(("name", "size"), [("person", "n"), ("person_s", "s")])
+def test_the_card_tells_the_stored_figures(name: str, size: str) -> None:
+    card = model_path(name).with_suffix(".md").read_text(encoding="utf-8")
+    stored = json.loads((ROOT / "docs" / "results" / "person" / f"{size}.json").read_text(encoding="utf-8"))
+    rows = dict(re.findall(r"^\| (.+?) \| ([\d.]+) \|", card, flags=re.MULTILINE))
     names = {"mask AP50": "segm_AP50", "mask AP": "segm_AP", "Boundary AP": "boundary_AP", "box AP50": "box_AP50"}
     told = {key: float(rows[name]) for name, key in names.items()}
-    assert told == {key: pytest.approx(STORED["int8"][key], abs=5e-4) for key in names.values()}
-    for word in ("Licence", "COCO", "ImageNet", "tools/person_model n"):
-        assert word in CARD
+    assert told == {key: pytest.approx(stored["int8"][key], abs=5e-4) for key in names.values()}
+    for word in ("licence", "coco", "imagenet", f"tools/person_model {size}"):
+        assert word in card.lower()
 
 
-def test_it_finds_the_people_of_walking_xyz() -> None:
+@pytest.mark.parametrize("name", CANVASES)
+def test_it_finds_the_people_of_walking_xyz(name: str) -> None:
     """Two in each photograph; the sixteenth is cut by the picture's edge."""
     if not PHOTOS.is_dir():
         pytest.skip("needs TUM's photographs beside the repository")
-    segmenter = Segmenter(Path("person"), threads=1)
+    segmenter = Segmenter(Path(name), threads=1)
     counts = []
     for file in sorted(PHOTOS.iterdir()):
         if (image := cv2.imread(str(file))) is not None:
@@ -73,4 +77,4 @@ def test_predict_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_a_name_that_is_none_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "wall.png"), np.full((120, 160, 3), 90, np.uint8))
     assert main(["predict", str(tmp_path / "wall.png"), "--model", "dog", "--out", str(tmp_path / "found")]) == 1
-    assert capsys.readouterr().err == "cohdc predict: dog: no such file; shipped networks: person\n"
+    assert capsys.readouterr().err == "cohdc predict: dog: no such file; shipped networks: person, person_s\n"

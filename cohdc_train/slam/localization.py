@@ -36,12 +36,17 @@ class Fit:
 
 
 class Localizer:
-    """Finds frames in a map. judges: groups of points that move against the rest are left out and lose weight."""
+    """Finds frames in a map.
 
-    def __init__(self, world: Map, weighing: Weighing, seed: int, judges: bool) -> None:
+    judges: groups of points that move against the rest are left out and lose weight; twice: every frame is asked for
+    `again`, and judged there, where corners are precise and smaller movements show.
+    """
+
+    def __init__(self, world: Map, weighing: Weighing, seed: int, judges: bool, twice: bool) -> None:
         self.map = world
         self._weighing = weighing
         self._judges = judges
+        self._twice = twice
         self._rng = np.random.default_rng(seed)
 
     def near(self, features: Features, rgb: NDArray[np.uint8], last: Fit, expected: Expectation) -> Fit | None:
@@ -96,15 +101,12 @@ class Localizer:
         matches = match_projected(projected, features, radius=5.0)
         points, seen = self.map.measured(matches, features)
         prior = None if expected is None else expected.given(len(matches))
-        moving = np.zeros(len(matches), dtype=np.bool_)
-        if self._judges:
-            found = self.map.found[matches.points]
-            T_cw, inlier, moving = pose_of_rest(rough.T_cw, points, seen, self._weighing, found, prior)
-        else:
-            T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing, prior=prior)
+        judges = self._judges and not self._twice
+        T_cw, inlier, moving = self._pose(rough.T_cw, matches.points, points, seen, prior, judges)
         if inlier.sum() < minimum:
             return None
-        self.map.judge(matches.points[inlier], matches.points[moving])
+        if judges:
+            self.map.judge(matches.points[inlier], matches.points[moving])
         matches = matches.take(inlier)
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
@@ -112,16 +114,29 @@ class Localizer:
         return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], *known)
 
     def again(self, features: Features, fit: Fit, expected: Expectation | None) -> Fit | None:
-        """The pose of the same frame by corners that were moved since; what no longer fits stays matched. None where
-        hardly anything fits. What was expected counts if it did the first time: a place found anew speaks against it.
+        """The pose of the same frame by corners that were moved since; what no longer fits stays matched, unless it
+        moves. None where hardly anything fits. What was expected counts if it did the first time: a place found anew
+        speaks against it.
         """
+        ids = fit.matches.points
         points, seen = self.map.measured(fit.matches, features)
         prior = expected.prior if expected is not None and fit.pull.any() else None
-        T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._weighing, prior=prior)
+        T_cw, inlier, moving = self._pose(fit.T_cw, ids, points, seen, prior, self._judges)
         if inlier.sum() < _MIN_TRACKED:
             return None
+        if self._judges:
+            self.map.judge(ids[inlier], ids[moving])
         known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
-        return Fit(T_cw, fit.matches, fit.reference, *known)
+        return Fit(T_cw, fit.matches.take(~moving), fit.reference, *known)
+
+    def _pose(
+        self, T_cw: Array, ids: NDArray[np.int64], points: Array, seen: Observations, prior: Prior | None, judges: bool
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """`pose_of_rest` of points `ids`, or the pose of all of them."""
+        if judges:
+            return pose_of_rest(T_cw, points, seen, self._weighing, self.map.found[ids], prior)
+        T_cw, inlier = optimize_pose(T_cw, points, seen, self._weighing, prior=prior)
+        return T_cw, inlier, np.zeros(len(ids), dtype=np.bool_)
 
 
 def known_by(

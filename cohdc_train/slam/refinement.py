@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features import LEVELS, SCALE, Features
+from cohdc_train.slam.features import SCALE, Features
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.optimization import Array, to_local
@@ -31,13 +31,13 @@ Floats = NDArray[np.float32]
 
 
 class Pyramid:
-    """A grey image at every level of the corners."""
+    """A grey image at the finer levels of the corners."""
 
     def __init__(self, gray: NDArray[np.uint8]) -> None:
         """gray: [H, W]."""
         height, width = gray.shape
         levels = [gray]
-        for level in range(1, LEVELS):
+        for level in range(1, _COARSEST + 1):
             size = (round(width / SCALE**level), round(height / SCALE**level))
             smaller = cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR_EXACT)
             levels.append(np.asarray(smaller, dtype=np.uint8))

@@ -80,7 +80,7 @@ class Tracker:
         self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
-        self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
+        self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights, self.method.refinement)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
         self._motion = Motion()
