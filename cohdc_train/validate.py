@@ -37,7 +37,7 @@ def validate(
     """Print a model's scores on the validation split of a COCO-format folder.
 
     Args:
-        model: best.ckpt or last.ckpt of a training, an ONNX file, or a shipped network's name: person.
+        model: best.ckpt or last.ckpt of a training, an ONNX file, or a shipped network's name: person, person_s.
         root: the COCO-format folder; its other classes are left out. Of an ONNX file, those that both have are scored.
         out: JSON file for the scores.
         rescore: rank masks by score * quality; the training's choice when not given, yes for an ONNX file.

@@ -52,7 +52,8 @@ def predict(
 
     Args:
         source: an image, a folder of images, a video, or a webcam's number such as 0.
-        model: ONNX file written by `cohdc export`, a foreign one that is known, or a shipped network's name: person.
+        model: ONNX file written by `cohdc export`, a foreign one that is known, or a shipped network's name: person,
+            person_s.
         out: folder for the results.
         score: least class score that is kept.
         quality: least mask quality that is kept; without it nothing is dropped for its quality.

@@ -114,9 +114,10 @@ class Localizer:
         return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], *known)
 
     def again(self, features: Features, fit: Fit, expected: Expectation | None) -> Fit | None:
-        """The pose of the same frame by corners that were moved since; what no longer fits stays matched, unless it
-        moves. None where hardly anything fits. What was expected counts if it did the first time: a place found anew
-        speaks against it.
+        """The pose of the same frame, by corners that may have been moved since; what does not fit stays matched,
+        unless it moves. None where hardly anything fits.
+
+        What was expected counts if it did the first time: a place found anew speaks against it.
         """
         ids = fit.matches.points
         points, seen = self.map.measured(fit.matches, features)

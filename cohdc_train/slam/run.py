@@ -57,7 +57,7 @@ def slam(
         sequence: folder with rgb.txt, depth.txt and their images, or left.txt and right.txt of a rectified stereo pair
             whose camera yaml has a baseline; groundtruth.txt is used for scores when there.
         out: folder for the results; files of a former run are replaced.
-        model: ONNX written by `cohdc export`, or a shipped network's name: person; every frame is segmented.
+        model: ONNX written by `cohdc export`, or a shipped network's name (person, person_s); every frame is segmented.
         masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
         camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
         seed: of the random samples; the same seed gives the same numbers.

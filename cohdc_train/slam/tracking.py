@@ -36,6 +36,10 @@ _KNOWN = 0.9  # share of a frame's points that are old, from which on its place 
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
 _CERTAIN = 1e9  # information of the first pose, which is where the world begins
 
+_Rgb = NDArray[np.uint8]
+_Depth = NDArray[np.float32]
+_Mask = NDArray[np.bool_]
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -116,17 +120,11 @@ class Tracker:
             return _pose_of(fit, t, False, start, tracked)
         given, mask = mask, self._dynamic(mask, depth_m, expected, t)
         self.mask = mask
-        features = self._corners(rgb, depth_m, mask, late)
-        fit = self._locate(features, rgb, expected)
+        pyramid = None if self._refiner is None else Pyramid(gray_of(rgb))
+        features, fit = self._matched(rgb, depth_m, mask, late, expected, pyramid)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
-            features = self._corners(rgb, depth_m, None, late)
-            fit = self._locate(features, rgb, expected)
-        pyramid = None if self._refiner is None or fit is None else Pyramid(gray_of(rgb))
-        if self._refiner is not None and fit is not None and fit.reference is not None and pyramid is not None:
-            refined = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
-            again = self._localizer.again(refined, fit, expected)
-            features, fit = (features, fit) if again is None else (refined, again)
+            features, fit = self._matched(rgb, depth_m, None, late, expected, pyramid)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
@@ -166,12 +164,7 @@ class Tracker:
         return self._log.trajectory(self.map, self.method.smoothing)
 
     def _by_flow(
-        self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
-        expected: Expectation,
-        mask: NDArray[np.bool_] | None,
-        late: float | None,
+        self, rgb: _Rgb, depth_m: _Depth, expected: Expectation, mask: _Mask | None, late: float | None
     ) -> Fit | None:
         """The pose by what the last matched frame saw; None where this one is to be matched."""
         if self._flow is None:
@@ -186,34 +179,42 @@ class Tracker:
         self.features, self.mask = features, mask
         return fit
 
-    def _dynamic(
+    def _matched(
         self,
-        mask: NDArray[np.bool_] | None,
-        depth_m: NDArray[np.float32],
+        rgb: _Rgb,
+        depth_m: _Depth,
+        mask: _Mask | None,
+        late: float | None,
         expected: Expectation | None,
-        t: float,
-    ) -> NDArray[np.bool_] | None:
+        pyramid: Pyramid | None,
+    ) -> tuple[Features, Fit | None]:
+        """The corners of a frame and its pose against the map: by where patches put them, else by where they lie."""
+        features = self._corners(rgb, depth_m, mask, late)
+        fit = self._locate(features, rgb, expected)
+        if fit is None or fit.reference is None or self._refiner is None or pyramid is None:
+            return features, fit
+        refined = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
+        again = self._localizer.again(refined, fit, expected)
+        return (features, self._localizer.again(features, fit, expected)) if again is None else (refined, again)
+
+    def _dynamic(self, mask: _Mask | None, depth_m: _Depth, expected: Expectation | None, t: float) -> _Mask | None:
         """The mask after depth had its say, where the camera is expected."""
         if not self.method.geometry or self._last is None or expected is None:
             return mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
         return self._dynamic_mask.of(mask, depth_m, expected.prior.T_cw, around, t)
 
-    def _corners(
-        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
-    ) -> Features:
+    def _corners(self, rgb: _Rgb, depth_m: _Depth, mask: _Mask | None, late: float | None) -> Features:
         return self._measured(self._extract.find(rgb, mask), depth_m, mask, late)
 
-    def _measured(
-        self, corners: Corners, depth_m: NDArray[np.float32], mask: NDArray[np.bool_] | None, late: float | None
-    ) -> Features:
+    def _measured(self, corners: Corners, depth_m: _Depth, mask: _Mask | None, late: float | None) -> Features:
         """The corners of a frame, all put at its one time; late: s by which depth was taken after colour."""
         twist = self._motion.twist
         lag = None if twist is None or late is None else exp_se3(twist * late)
         features = self._extract.measure(corners, depth_m, mask, lag)
         return features if twist is None else unrolled(features, self.camera, twist)
 
-    def _locate(self, features: Features, rgb: NDArray[np.uint8], expected: Expectation | None) -> Fit | None:
+    def _locate(self, features: Features, rgb: _Rgb, expected: Expectation | None) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
@@ -241,13 +242,7 @@ class Tracker:
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
     def _add_keyframe(
-        self,
-        features: Features,
-        fit: Fit,
-        t: float,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
-        pyramid: Pyramid | None,
+        self, features: Features, fit: Fit, t: float, rgb: _Rgb, depth_m: _Depth, pyramid: Pyramid | None
     ) -> Fit:
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points

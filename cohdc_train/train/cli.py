@@ -72,7 +72,7 @@ class FitCommand(LightningCLI):
             "--pretrained",
             type=Path | None,
             default=None,
-            help="checkpoint, exported file or shipped network (person) to start from, of other classes too",
+            help="checkpoint, exported file or shipped network (person, person_s) to start from, of other classes too",
         )
         parser.add_argument(
             "--ema", type=float, default=0.0, help="decay of the weights' moving average, such as .999; 0: none"

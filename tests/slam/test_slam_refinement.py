@@ -20,7 +20,7 @@ from cohdc_train.slam.tracking import Tracker
 PICTURE = cv2.cvtColor(cv2.GaussianBlur(texture(np.random.default_rng(0), 240, 320), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)
 PYRAMID = Pyramid(np.asarray(PICTURE, dtype=np.uint8))
 CORNERS = FeatureExtractor(CAMERA, 150)(cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2RGB), np.ones((240, 320), np.float32))
-INSIDE = ((CORNERS.pixels > 60) & (CORNERS.pixels < (260, 180))).all(axis=1)
+INSIDE = ((CORNERS.pixels > 60) & (CORNERS.pixels < (260, 180))).all(axis=1) & (CORNERS.octaves <= 4)
 
 
 @settings(max_examples=25)
