@@ -124,10 +124,16 @@ def test_another_canvas_than_the_trainings(checkpoint, opinionated, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cqe", "side"), [("multiply", 28), ("add", 28), ("off", 28), ("concat", 56), ("add", 56)])
-def test_every_form_of_mask_and_quality_head_exports(cqe, side, opinionated, tmp_path):
+@pytest.mark.parametrize(
+    ("cqe", "side", "cut"),
+    [
+        *[("multiply", 28, "half"), ("add", 28, "half"), ("off", 28, "half"), ("concat", 56, "half")],
+        *[("add", 56, "half"), ("concat", 28, "quality")],
+    ],
+)
+def test_every_form_of_mask_and_quality_head_exports(cqe, side, cut, opinionated, tmp_path):
     torch.manual_seed(0)
-    config = dataclasses.replace(opinionated.config, cqe=cqe, mask_size=side)
+    config = dataclasses.replace(opinionated.config, cqe=cqe, mask_size=side, mask_cut=cut)
     module = MaskRCNNModule(["person", "car"], config)
     rest = {name: value for name, value in opinionated.state_dict().items() if not name.startswith("cqe.")}
     module.network.load_state_dict(rest, strict=False)
@@ -135,6 +141,7 @@ def test_every_form_of_mask_and_quality_head_exports(cqe, side, opinionated, tmp
     report = json.loads(export(tmp_path / f"{cqe}.ckpt").with_name("model.onnx.json").read_text())
     assert report["detections_compared"] > 20
     assert report["max_difference"]["quality"] <= 1e-3
+    assert report["max_difference"]["masks"] <= 1e-3
 
 
 @pytest.mark.slow

@@ -56,6 +56,8 @@ class NetworkConfig:
         cqe_target: what the CQE head regresses: mask IoU ("iou"), (1 + CIoU) / 2 ("ciou", the paper's S_iou),
             Boundary IoU ("boundary_iou"), or the smaller of it and mask IoU ("min").
         mask_size: side of the predicted masks, cells: 28, or 56 by one more deconvolution.
+        mask_cut: what a mask's 0.5 stands for at inference: as likely as not ("half"), or the cut of the greatest
+            expected IoU by CQE's estimate of it ("quality", `inference.cut_by_quality`).
         proposals: proposals kept per image in training and at inference.
         rois: proposals per image that train the box head, a quarter of them positive.
         detections: rows of the padded output.
@@ -79,6 +81,7 @@ class NetworkConfig:
     cqe: Fusion | Literal["off"] = "concat"
     cqe_target: Goal = "iou"
     mask_size: MaskSize = 28
+    mask_cut: Literal["half", "quality"] = "half"
     proposals: tuple[int, int] = (1000, 300)
     rois: int = 256
     detections: int = 100
@@ -91,6 +94,8 @@ class NetworkConfig:
             raise ValueError(f"anchor_scales {self.anchor_scales}: {scales} scales for {levels} or {levels + 1} levels")
         if not 0 <= self.frozen_stages <= 5:
             raise ValueError(f"frozen_stages {self.frozen_stages}: a ResNet has a stem and 4 stages")
+        if self.mask_cut == "quality" and (self.cqe == "off" or self.cqe_target != "iou"):
+            raise ValueError("mask_cut quality needs a CQE head that estimates the mask's IoU")
         if self.weights is not None and self.width != 1.0:
             raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
 

@@ -5,6 +5,8 @@ import dataclasses
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import nn
 from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
 from torchvision.models.detection.image_list import ImageList
@@ -12,6 +14,7 @@ from torchvision.models.detection.rpn import RegionProposalNetwork
 from torchvision.ops import box_iou
 
 from cohdc_train.models import Detector, MaskRCNN, NetworkConfig, detect
+from cohdc_train.models.inference import cut_by_quality
 
 
 def _target(boxes, size=(96, 128), ignore=()):
@@ -125,6 +128,38 @@ def test_padding_is_zero_and_scores_fall(opinionated):
         assert torch.all(scores[i, :n] > opinionated.config.score_threshold)
         assert torch.all(scores[i].diff() <= 0)
         assert all(not tensor[i, n:].any() for tensor in (boxes, labels, scores, quality, masks))
+
+
+@given(seed=st.integers(0, 2**32 - 1), sharpness=st.floats(1.0, 4.0))
+def test_a_mask_cut_by_the_best_expected_iou_is_the_mask_that_has_it(seed, sharpness):
+    """Of all cuts of one mask, tried one by one. Expected: of the intersection over that of the union."""
+    p = (sharpness * torch.randn(12, 12, generator=torch.Generator().manual_seed(seed)).double()).sigmoid()
+    best_first = p.flatten().sort(descending=True).values
+    inside = best_first.cumsum(0)
+    united = torch.arange(1, 145) + p.sum() - inside
+    best = int((inside / united).argmax())
+    cut = cut_by_quality(p[None], (inside / united)[best].reshape(1))[0] > 0.5
+    assert torch.equal(cut, p > best_first[best + 1])
+
+
+def test_a_perfect_mask_is_cut_at_half_and_no_mask_below_a_fifth():
+    p = torch.linspace(0, 1, 101).reshape(1, 1, -1)
+    torch.testing.assert_close(cut_by_quality(p, torch.ones(1)), p)
+    assert p[cut_by_quality(p, torch.zeros(1)) > 0.5].min().item() == pytest.approx(0.21)
+
+
+def test_cutting_by_quality_moves_masks_and_nothing_else(opinionated):
+    images = torch.randint(0, 255, (1, 80, 60, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    by_quality = MaskRCNN(2, dataclasses.replace(opinionated.config, mask_cut="quality")).eval()
+    by_quality.load_state_dict(opinionated.state_dict())
+    with torch.inference_mode():
+        *found, masks, count = Detector(opinionated)(images)
+        *others, moved, other_count = Detector(by_quality)(images)
+    quality, n = found[-1], int(count[0])
+    assert all(torch.equal(one, other) for one, other in zip([*found, count], [*others, other_count], strict=True))
+    torch.testing.assert_close(moved[0, :n], cut_by_quality(masks[0, :n], quality[0, :n]))
+    assert not moved[0, n:].any()
+    assert (moved[0, :n] - masks[0, :n]).max() > 0.01
 
 
 def test_only_detections_go_through_the_mask_and_cqe_heads(opinionated):
@@ -255,6 +290,8 @@ def test_cqe_can_be_left_out(small_config):
         ({"finest_stride": 8, "anchor_scales": (8, 16, 32, 64, 128)}, "5 scales for 3 or 4 levels"),
         ({"frozen_stages": 6}, "frozen_stages 6"),
         ({"weights": "IMAGENET1K_V1", "width": 0.5}, "full width"),
+        ({"mask_cut": "quality", "cqe": "off"}, "mask_cut quality"),
+        ({"mask_cut": "quality", "cqe_target": "boundary_iou"}, "mask_cut quality"),
     ],
 )
 def test_a_config_that_cannot_be_built_is_refused(change, message):
