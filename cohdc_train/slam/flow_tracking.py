@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.features import Corners, Features, gray_of
-from cohdc_train.slam.localization import Fit, known_by
+from cohdc_train.slam.localization import Fit
 from cohdc_train.slam.map import Map
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.motion import Expectation
-from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, to_local
+from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
 
 _BETWEEN = 2  # frames in a row: ten times a second the map is consulted
 _WINDOW = (13, 13)  # px of a patch
@@ -108,8 +108,8 @@ class FlowTracker:
         T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < least:
             return None
-        known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
-        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, *known)
+        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
+        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, prior, information)
 
     def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
         """[m, 2] px as the lens shows them, of points of the map."""

@@ -10,13 +10,14 @@ from cohdc_train.slam.features import Features
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.motion import Expectation
-from cohdc_train.slam.optimization import Array, Observations, Prior, Weighing, optimize_pose, pose_information
+from cohdc_train.slam.optimization import Array, Prior, Weighing, optimize_pose, pose_information
 from cohdc_train.slam.ransac import ransac_pose
 from cohdc_train.slam.rigidity import pose_of_rest
 
 LOCAL_KEYFRAMES = 15
 _MIN_FIRST = 15  # inliers of the first, rough pose
 _MIN_TRACKED = 25  # inliers of the pose against the local map
+_AS_BEFORE = 0.7  # of the last frame's matches: where a pose that was only expected finds fewer, it is not believed
 _MIN_FOUND_AGAIN = 40  # the same when the place was lost
 _CANDIDATES = 6  # keyframes tried per lost frame
 
@@ -24,33 +25,46 @@ _CANDIDATES = 6  # keyframes tried per lost frame
 @dataclass(frozen=True)
 class Fit:
     """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference: the keyframe that
-    sees most of them, None while the pose is a rough one; information: [6, 6] inverse covariance of the pose by what is
-    seen alone, in the camera's frame, 0 where nobody asks for it; pull: [6] `Prior.pull` of what was expected, 0 where
-    it did not count."""
+    sees most of them, None while the pose is a rough one; prior: what was expected, where that counted as well;
+    information: [6, 6] inverse covariance of the pose by what is seen alone, in the camera's frame, 0 until the pose is
+    settled."""
 
     T_cw: Array
     matches: Matches
     reference: Keyframe | None = None
+    prior: Prior | None = None
     information: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    pull: Array = field(default_factory=lambda: np.zeros(6))
+
+    @property
+    def pull(self) -> Array:
+        """[6] `Prior.pull` of what was expected, 0 where it did not count."""
+        return np.zeros(6) if self.prior is None else self.prior.pull(self.T_cw)
 
 
 class Localizer:
-    """Finds frames in a map.
+    """Finds frames in a map, in two steps: which points a frame sees (`near`, `anywhere`), and where it is (`settle`).
 
-    judges: groups of points that move against the rest are left out and lose weight; twice: every frame is asked for
-    `again`, and judged there, where corners are precise and smaller movements show.
+    judges: groups of points that move against the rest are left out and lose weight.
     """
 
-    def __init__(self, world: Map, weighing: Weighing, seed: int, judges: bool, twice: bool) -> None:
+    def __init__(self, world: Map, weighing: Weighing, seed: int, judges: bool) -> None:
         self.map = world
         self._weighing = weighing
         self._judges = judges
-        self._twice = twice
         self._rng = np.random.default_rng(seed)
 
     def near(self, features: Features, rgb: NDArray[np.uint8], last: Fit, expected: Expectation) -> Fit | None:
-        """The frame after `last`. Where it sees little, what was expected counts as well."""
+        """The frame after `last`. Where it sees little, what was expected counts as well.
+
+        A camera that moves calmly is where it is expected, to a few px: the map is asked at once. Where it does not
+        answer, a rough pose comes first.
+        """
+        if expected.calm:
+            there = Fit(expected.prior.T_cw, last.matches)
+            enough = max(_MIN_TRACKED, round(_AS_BEFORE * len(last.matches)))
+            fit = self._against_local_map(features, there, enough, expected)
+            if fit is not None:
+                return fit
         rough = self._follow(features, last, expected)
         if rough is None:
             return self.anywhere(features, rgb)
@@ -95,56 +109,41 @@ class Localizer:
     def _against_local_map(
         self, features: Features, rough: Fit, minimum: int, expected: Expectation | None = None
     ) -> Fit | None:
-        """The final pose, from all points of the keyframes around."""
+        """The pose from all points of the keyframes around."""
         keyframes = self.map.covisible(rough.matches.points, LOCAL_KEYFRAMES)
         projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
         matches = match_projected(projected, features, radius=5.0)
         points, seen = self.map.measured(matches, features)
         prior = None if expected is None else expected.given(len(matches))
-        judges = self._judges and not self._twice
-        T_cw, inlier, moving = self._pose(rough.T_cw, matches.points, points, seen, prior, judges)
+        T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing, prior=prior)
         if inlier.sum() < minimum:
             return None
-        if judges:
-            self.map.judge(matches.points[inlier], matches.points[moving])
         matches = matches.take(inlier)
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
-        known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
-        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], *known)
+        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], prior)
 
-    def again(self, features: Features, fit: Fit, expected: Expectation | None) -> Fit | None:
-        """The pose of the same frame, by corners that may have been moved since; what does not fit stays matched,
-        unless it moves. None where hardly anything fits.
+    def settle(self, features: Features, fit: Fit) -> Fit | None:
+        """The final pose of a frame that was found, by corners that may have been moved since. None where hardly
+        anything fits.
 
-        What was expected counts if it did the first time: a place found anew speaks against it.
+        What does not fit stays matched, unless it moves. What was expected counts if it did when the frame was found:
+        a place found anew speaks against it.
         """
         ids = fit.matches.points
         points, seen = self.map.measured(fit.matches, features)
-        prior = expected.prior if expected is not None and fit.pull.any() else None
-        T_cw, inlier, moving = self._pose(fit.T_cw, ids, points, seen, prior, self._judges)
+        if self._judges:
+            known = self.map.found[ids]
+            T_cw, inlier, moving = pose_of_rest(fit.T_cw, points, seen, self._weighing, known, fit.prior)
+        else:
+            T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._weighing, prior=fit.prior)
+            moving = np.zeros(len(ids), dtype=np.bool_)
         if inlier.sum() < _MIN_TRACKED:
             return None
         if self._judges:
             self.map.judge(ids[inlier], ids[moving])
-        known = known_by(T_cw, points[inlier], seen.take(inlier), self._weighing, prior)
-        return Fit(T_cw, fit.matches.take(~moving), fit.reference, *known)
-
-    def _pose(
-        self, T_cw: Array, ids: NDArray[np.int64], points: Array, seen: Observations, prior: Prior | None, judges: bool
-    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """`pose_of_rest` of points `ids`, or the pose of all of them."""
-        if judges:
-            return pose_of_rest(T_cw, points, seen, self._weighing, self.map.found[ids], prior)
-        T_cw, inlier = optimize_pose(T_cw, points, seen, self._weighing, prior=prior)
-        return T_cw, inlier, np.zeros(len(ids), dtype=np.bool_)
-
-
-def known_by(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, prior: Prior | None
-) -> tuple[Array, Array]:
-    """Information and pull of a `Fit` at T_cw [4, 4] to points [m, 3], of which the frame measured `seen`."""
-    return pose_information(T_cw, points, seen, weighing), np.zeros(6) if prior is None else prior.pull(T_cw)
+        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
+        return Fit(T_cw, fit.matches.take(~moving), fit.reference, fit.prior, information)
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -71,9 +71,15 @@ class Refiner:
     def __post_init__(self) -> None:
         self._patches = np.zeros((0, _STORED, _STORED), dtype=np.uint8)
         self._octaves = np.zeros(0, dtype=np.int64)
+        self._pyramid: Pyramid | None = None
 
-    def remember(self, keyframe: Keyframe, pyramid: Pyramid) -> None:
-        """Cut out the points that were born in a keyframe, the newest in the map."""
+    def look_at(self, gray: NDArray[np.uint8]) -> None:
+        """The frame that is meant from now on, [H, W]."""
+        self._pyramid = Pyramid(gray)
+
+    def remember(self, keyframe: Keyframe) -> None:
+        """Cut out the points that were born in a keyframe, the newest in the map, made of the frame looked at."""
+        assert self._pyramid is not None
         grown = len(self.world.positions) - len(self._patches)  # the map doubles its arrays, so this is rarely copied
         if grown > 0:
             self._patches = np.concatenate([self._patches, np.zeros((grown, _STORED, _STORED), dtype=np.uint8)])
@@ -83,13 +89,17 @@ class Refiner:
         corners = np.flatnonzero((keyframe.point_ids >= 0) & (keyframe.features.octaves <= _COARSEST))
         corners = corners[self.world.born[keyframe.point_ids[corners]] == keyframe.index]
         ids, octaves = keyframe.point_ids[corners], keyframe.features.octaves[corners]
-        patches = pyramid.cut(keyframe.features.pixels[corners], octaves, _STORED)
+        patches = self._pyramid.cut(keyframe.features.pixels[corners], octaves, _STORED)
         self._patches[ids] = np.rint(patches).reshape(-1, _STORED, _STORED)
         self._octaves[ids] = octaves
         keyframe.features.precise[corners] = True  # where the patch lies, by which others are moved
 
-    def refine(self, features: Features, matches: Matches, T_cw: Array, pyramid: Pyramid) -> Features:
-        """The features with those matched corners moved that found a better place. T_cw: [4, 4] the frame's pose."""
+    def refine(self, features: Features, matches: Matches, T_cw: Array) -> Features:
+        """The features with those matched corners moved that found a better place in the frame looked at.
+
+        T_cw: [4, 4] the frame's pose.
+        """
+        assert self._pyramid is not None
         matches = matches.take(features.octaves[matches.corners] <= _COARSEST)
         if len(matches) == 0:
             return features
@@ -98,7 +108,7 @@ class Refiner:
         A = affine(self.world, ids, T_cw)
         back = np.linalg.inv(A) * (SCALE ** (octaves - self._octaves[ids]))[:, None, None]
         template = warped(self._patches[ids], back, _SIDE + 2)
-        shift, good = align(pyramid, features.pixels[corners], octaves, template)
+        shift, good = align(self._pyramid, features.pixels[corners], octaves, template)
         rows = corners[good]
         pixels, points = features.pixels.copy(), features.points.copy()
         pixels[rows] += shift[good] * SCALE ** octaves[good, None]

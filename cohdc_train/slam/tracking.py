@@ -24,7 +24,7 @@ from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.motion import Expectation, Motion
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse
-from cohdc_train.slam.refinement import Pyramid, Refiner
+from cohdc_train.slam.refinement import Refiner
 from cohdc_train.slam.shutter import unrolled
 from cohdc_train.slam.window import adjust_everything
 
@@ -84,7 +84,7 @@ class Tracker:
         self._refiner = Refiner(self.map) if self.method.refinement else None
         self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
         self._mapper = None if executor is None else BackgroundMapper(executor, self._weighing)
-        self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights, self.method.refinement)
+        self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._loops = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
         self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
         self._motion = Motion()
@@ -120,11 +120,12 @@ class Tracker:
             return _pose_of(fit, t, False, start, tracked)
         given, mask = mask, self._dynamic(mask, depth_m, expected, t)
         self.mask = mask
-        pyramid = None if self._refiner is None else Pyramid(gray_of(rgb))
-        features, fit = self._matched(rgb, depth_m, mask, late, expected, pyramid)
+        if self._refiner is not None:
+            self._refiner.look_at(gray_of(rgb))
+        features, fit = self._matched(rgb, depth_m, mask, late, expected)
         covered = fit is None and mask is not None and bool(self.map.keyframes)
         if covered:
-            features, fit = self._matched(rgb, depth_m, None, late, expected, pyramid)
+            features, fit = self._matched(rgb, depth_m, None, late, expected)
         self.features = features
         tracked = time.perf_counter()
         keyframe = fit is not None and not covered and self._wants_keyframe(fit)
@@ -132,7 +133,7 @@ class Tracker:
             self._motion.found(t, fit.T_cw, fit.information, fit.pull)
         if fit is not None and keyframe:
             before = fit.T_cw
-            fit = self._add_keyframe(features, fit, t, rgb, depth_m, pyramid)
+            fit = self._add_keyframe(features, fit, t, rgb, depth_m)
             if self._loops is not None:
                 fit = self._close_loop(fit, self._loops, take_picture(rgb, depth_m, mask, self.camera))
             if self.method.keyframe_culling:
@@ -180,22 +181,16 @@ class Tracker:
         return fit
 
     def _matched(
-        self,
-        rgb: _Rgb,
-        depth_m: _Depth,
-        mask: _Mask | None,
-        late: float | None,
-        expected: Expectation | None,
-        pyramid: Pyramid | None,
+        self, rgb: _Rgb, depth_m: _Depth, mask: _Mask | None, late: float | None, expected: Expectation | None
     ) -> tuple[Features, Fit | None]:
         """The corners of a frame and its pose against the map: by where patches put them, else by where they lie."""
         features = self._corners(rgb, depth_m, mask, late)
         fit = self._locate(features, rgb, expected)
-        if fit is None or fit.reference is None or self._refiner is None or pyramid is None:
+        if fit is None or fit.reference is None:
             return features, fit
-        refined = self._refiner.refine(features, fit.matches, fit.T_cw, pyramid)
-        again = self._localizer.again(refined, fit, expected)
-        return (features, self._localizer.again(features, fit, expected)) if again is None else (refined, again)
+        refined = features if self._refiner is None else self._refiner.refine(features, fit.matches, fit.T_cw)
+        settled = self._localizer.settle(refined, fit)
+        return (features, self._localizer.settle(features, fit)) if settled is None else (refined, settled)
 
     def _dynamic(self, mask: _Mask | None, depth_m: _Depth, expected: Expectation | None, t: float) -> _Mask | None:
         """The mask after depth had its say, where the camera is expected."""
@@ -241,16 +236,14 @@ class Tracker:
             return True
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
-    def _add_keyframe(
-        self, features: Features, fit: Fit, t: float, rgb: _Rgb, depth_m: _Depth, pyramid: Pyramid | None
-    ) -> Fit:
+    def _add_keyframe(self, features: Features, fit: Fit, t: float, rgb: _Rgb, depth_m: _Depth) -> Fit:
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.corners] = fit.matches.points
         pictures = thumbnail(rgb), self._geometry.nearest(depth_m)
         keyframe = Keyframe(self.map.joined, t, fit.T_cw, features, point_ids, *pictures)
         insert_keyframe(self.map, keyframe, self._weighing, self._mapper)
-        if self._refiner is not None and pyramid is not None:
-            self._refiner.remember(keyframe, pyramid)
+        if self._refiner is not None:
+            self._refiner.remember(keyframe)
         self._since_keyframe = 0
         self._reference_inliers = 0
         return _fit_of(keyframe, fit.information)
@@ -282,7 +275,7 @@ class Tracker:
 
 def _fit_of(keyframe: Keyframe, information: Array) -> Fit:
     corners = np.flatnonzero(keyframe.point_ids >= 0)
-    return Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners), keyframe, information)
+    return Fit(keyframe.T_cw, Matches(keyframe.point_ids[corners], corners), keyframe, information=information)
 
 
 def _pose_of(fit: Fit | None, t: float, keyframe: bool, start: float, tracked: float) -> Pose:

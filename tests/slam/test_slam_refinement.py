@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
-from cohdc_train.slam.features import FeatureExtractor
+from cohdc_train.slam.features import FeatureExtractor, gray_of
 from cohdc_train.slam.map import observations
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
@@ -83,15 +83,15 @@ def test_what_a_rolling_shutter_moved_stays_moved(tracker: Tracker) -> None:
     keyframe = tracker.map.keyframes[0]
     corners = np.flatnonzero(keyframe.point_ids >= 0)
     matches, features = Matches(keyframe.point_ids[corners], corners), keyframe.features
-    pyramid = Pyramid(np.asarray(cv2.cvtColor(FIRST_VIEW, cv2.COLOR_RGB2GRAY), np.uint8))
     refiner = Refiner(tracker.map)
-    refiner.remember(keyframe, pyramid)
+    refiner.look_at(gray_of(FIRST_VIEW))
+    refiner.remember(keyframe)
     aside = replace(features, pixels=features.pixels + 0.4)
     refined = [
-        refiner.refine(replace(aside, points=aside.points + shift), matches, keyframe.T_cw, pyramid).points
+        refiner.refine(replace(aside, points=aside.points + shift), matches, keyframe.T_cw).points
         for shift in (0.0, 3.0)
     ]
-    assert (refined[0] != features.points).any()
+    assert (refined[0] != keyframe.features.points).any()
     np.testing.assert_allclose(refined[1] - refined[0], 3.0)
 
 
@@ -102,8 +102,8 @@ def test_what_fits_nowhere_is_not_precise(tracker: Tracker) -> None:
     matches, refiner = Matches(keyframe.point_ids[corners], corners), tracker._refiner
     assert refiner is not None
     for picture, least, most in ((FIRST_VIEW, 0.5, 1.0), (np.ascontiguousarray(FIRST_VIEW[::-1]), 0.0, 0.05)):
-        pyramid = Pyramid(np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8))
-        found = refiner.refine(keyframe.features, matches, keyframe.T_cw, pyramid)
+        refiner.look_at(gray_of(picture))
+        found = refiner.refine(keyframe.features, matches, keyframe.T_cw)
         assert least <= found.precise.mean() <= most
         np.testing.assert_array_equal(found.pixels[~found.precise], keyframe.features.pixels[~found.precise])
 
@@ -114,7 +114,8 @@ def test_a_point_without_a_patch_does_not_take_over_a_former_one(tracker: Tracke
     wide = world.keyframes[0].features.octaves > 4
     ids = world.keyframes[0].point_ids
     refiner._patches[:] = 77  # of points that once had these rows
-    refiner.remember(world.keyframes[0], Pyramid(np.asarray(cv2.cvtColor(FIRST_VIEW, cv2.COLOR_RGB2GRAY), np.uint8)))
+    refiner.look_at(gray_of(FIRST_VIEW))
+    refiner.remember(world.keyframes[0])
     assert (refiner._patches[ids[wide & (ids >= 0)]] == 0).all()
     assert refiner._patches[ids[~wide & (ids >= 0)]].std() > 10
 

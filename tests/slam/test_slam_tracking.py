@@ -62,6 +62,22 @@ def test_the_place_is_found_again_after_a_black_out(views: list[View]) -> None:
     assert ate(tracker, path) < 0.005
 
 
+def test_a_calm_camera_asks_the_map_at_once_and_a_jolted_one_first_guesses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The jolt: the picture moves by 45 px from one frame to the next."""
+    tracker, guessed = Tracker(CAMERA, features=500), []
+    solve = tracker._localizer._solve
+    monkeypatch.setattr(tracker._localizer, "_solve", lambda *a, **k: guessed.append(len(poses)) or solve(*a, **k))
+    path = exp_se3(np.outer(np.arange(24), [0.006, 0.0, 0.0, 0.0, 0.003, 0.0]))
+    path[23] = path[23] @ exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.16, 0.0]))
+    poses: list[Pose] = []
+    for index, T_wc in enumerate(path):
+        poses.append(tracker.track(*render(room(), T_wc)[:2], index / 30))
+    assert set(guessed) == {23}
+    T_wc = poses[-1].T_wc
+    assert T_wc is not None
+    np.testing.assert_allclose(T_wc, path[23], atol=0.01)
+
+
 def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Five are missing, in which the wall moves by 72 px: no place is looked up, for the motion says where to look."""
     path = exp_se3(np.outer(np.arange(13) - 5, [0.12, 0.0, 0.01, 0.0, 0.01, 0.0]))
