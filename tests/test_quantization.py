@@ -1,4 +1,4 @@
-"""Static quantisation of a MobileNet block: what is rounded how, and that nothing saturates."""
+"""Static quantisation of a MobileNet block behind a stem: what is rounded how, and that nothing saturates."""
 
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,12 @@ from cohdc_train.export.quantization import quantize
 CHANNELS = 8
 
 
-def block(path: Path) -> None:
-    """uint8 pictures -> float -> 3x3 convolution, ReLU6, depthwise convolution, ReLU6, 1x1 convolution."""
+def block(path: Path, stem: bool = True) -> None:
+    """uint8 pictures -> float -> a stem that changes nothing -> 3x3 convolution, ReLU6, depthwise convolution, ReLU6,
+    1x1 convolution.
+
+    stem: whether its second convolution is depthwise; else it is one ordinary convolution.
+    """
     rng = np.random.default_rng(0)
     numbers: dict[str, NDArray[Any]] = {
         "scale": np.float32(1 / 255),
@@ -26,11 +30,23 @@ def block(path: Path) -> None:
         "dense": rng.uniform(0, 0.3, (CHANNELS, 3, 3, 3)).astype(np.float32),  # all of one sign: sums grow
         "depthwise": rng.normal(0, 0.4, (CHANNELS, 1, 3, 3)).astype(np.float32),
         "pointwise": rng.uniform(0, 1, (CHANNELS, CHANNELS, 1, 1)).astype(np.float32),
+        "same": np.eye(3, dtype=np.float32).reshape(3, 3, 1, 1),
+        "each": np.ones((3, 1, 1, 1), np.float32),
     }
+    light = [
+        helper.make_node("Conv", ["picture", "same"], ["p"], "stem1", group=1),
+        helper.make_node("Conv", ["p", "each"], ["q"], "stem2", group=3),
+        helper.make_node("Conv", ["q", "same"], ["x"], "stem3", group=1),
+    ]
+    heavy = [
+        helper.make_node("Conv", ["picture", "same"], ["p"], "stem1", group=1),
+        helper.make_node("Conv", ["p", "same"], ["x"], "stem2", group=1),
+    ]
     nodes = [
         helper.make_node("Cast", [signature.INPUT], ["float"], "cast", to=onnx.TensorProto.FLOAT),
         helper.make_node("Transpose", ["float"], ["planes"], "transpose", perm=[0, 3, 1, 2]),
-        helper.make_node("Mul", ["planes", "scale"], ["x"], "mul"),
+        helper.make_node("Mul", ["planes", "scale"], ["picture"], "mul"),
+        *(light if stem else heavy),
         helper.make_node("Conv", ["x", "dense"], ["a"], "first", group=1, pads=[1, 1, 1, 1]),
         helper.make_node("Clip", ["a", "zero", "six"], ["b"], "relu6"),
         helper.make_node("Conv", ["b", "depthwise"], ["c"], "second", group=CHANNELS, pads=[1, 1, 1, 1]),
@@ -71,7 +87,19 @@ def test_relu6_is_left_to_the_rounding_behind_it(made: tuple[Path, Path, Any]) -
     before = {output: node.op_type for node in graph.node for output in node.output}
     assert not [node for node in graph.node if node.op_type == "Clip"]
     rounded = [before[node.input[0]] for node in graph.node if node.op_type == "QuantizeLinear"]
-    assert sorted(rounded) == ["Conv", "Conv", "Conv", "Mul"]
+    assert sorted(rounded) == ["Conv", "Conv", "Conv", "Conv"]
+
+
+def test_a_light_stem_stays_exact_and_a_heavy_one_does_not(made: tuple[Path, Path, Any], tmp_path: Path) -> None:
+    def float_convolutions(path: Path) -> list[str]:
+        graph = onnx.load(path).graph
+        rounded = {output for node in graph.node if node.op_type == "DequantizeLinear" for output in node.output}
+        return [node.name for node in graph.node if node.op_type == "Conv" and node.input[1] not in rounded]
+
+    assert float_convolutions(made[1]) == ["stem1", "stem2", "stem3"]
+    block(tmp_path / "heavy.onnx", stem=False)
+    assert quantize(tmp_path / "heavy.onnx", tmp_path / "int8.onnx", made[2]) == 7
+    assert float_convolutions(tmp_path / "int8.onnx") == []
 
 
 def test_no_sum_saturates(made: tuple[Path, Path, list[NDArray[np.uint8]]]) -> None:

@@ -17,6 +17,7 @@ from cohdc_train import signature
 CALIBRATION_IMAGES = 64
 _OPERATORS = ("Conv", "Gemm", "Relu", "Clip", "Add", "MaxPool", "Resize")
 _FLOAT = ("mask_predictor", "cqe.")  # contours and their quality are read off these
+_FINEST = "fpn.inner_blocks.0"  # makes the finest level, whose few channels come soon after a light network's stem
 
 
 def quantize(source: Path, target: Path, pictures: Iterable[NDArray[np.uint8]]) -> int:
@@ -26,6 +27,9 @@ def quantize(source: Path, target: Path, pictures: Iterable[NDArray[np.uint8]]) 
     RGB each. The mask predictor and the CQE head stay in float32, and so does all arithmetic on pixels and boxes.
     Weights that are multiplied as matrices have 7 bits: on x86 without VNNI the sum of two products is kept in 16 bits,
     and saturates with 8 of them (docs/results/int8.md). Depthwise convolutions have a way of their own there.
+
+    In float32 stay, too, the stem of a light network and what makes the pyramid's finest level of it: few channels,
+    each of its own range, at the highest resolution, from which masks are cut.
     """
     model = onnx.load(str(source))
     nodes = _bearing(model.graph)
@@ -86,14 +90,23 @@ class _Pictures(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime is 
 def _bearing(graph: onnx.GraphProto) -> list[str]:
     """Names of the operators on feature maps and on pooled features, without those that stay in float32."""
     constants = {tensor.name for tensor in graph.initializer}
+    stem = _light_stem(graph)
+    exact = (*_FLOAT, _FINEST) if stem else _FLOAT
     features: set[str] = set()
     names = []
     for node in graph.node:
-        if node.op_type not in _OPERATORS or any(part in name for name in node.input for part in _FLOAT):
+        if node.op_type not in _OPERATORS or any(part in name for name in node.input for part in exact):
             continue
         data = [name for name in node.input if name and name not in constants]
-        begins = node.op_type in ("Conv", "Gemm")
+        begins = node.op_type in ("Conv", "Gemm") and node.name not in stem
         if begins or (data and data[0] in features and all(d in features for d in data if node.op_type == "Add")):
             features.update(node.output)
             names.append(node.name)
     return names
+
+
+def _light_stem(graph: onnx.GraphProto) -> list[str]:
+    """Names of the first three convolutions where the second is depthwise, as in MobileNets; else none."""
+    first = [node for node in graph.node if node.op_type == "Conv"][:3]
+    groups = [attribute.i for node in first[1:2] for attribute in node.attribute if attribute.name == "group"]
+    return [node.name for node in first] if groups and groups[0] > 1 else []
