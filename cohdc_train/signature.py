@@ -24,5 +24,5 @@ KEY_CONTRACT = "cohdc.contract"  # CONTRACT_VERSION
 KEY_VERSION = "cohdc.version"  # version of the package that wrote the file
 KEY_CLASSES = "cohdc.classes"  # JSON: [name, ...] in label order
 KEY_INPUT = "cohdc.input"  # JSON: {"color", "layout", "dtype", "canvas": [height, width], "resize"}
-KEY_THRESHOLDS = "cohdc.thresholds"  # JSON: {"score", "nms_iou", "mask"}
+KEY_THRESHOLDS = "cohdc.thresholds"  # JSON: {"score", "nms_iou", "mask", "mask_cut": "half", or "quality"}
 METADATA_KEYS = (KEY_CONTRACT, KEY_VERSION, KEY_CLASSES, KEY_INPUT, KEY_THRESHOLDS)

@@ -94,6 +94,8 @@ def test_metadata_and_shapes_keep_the_contract(exported):
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     assert set(signature.METADATA_KEYS) <= set(metadata)
     assert json.loads(metadata[signature.KEY_CLASSES]) == ["person", "car"]
+    assert json.loads(metadata[signature.KEY_THRESHOLDS])["mask_cut"] == "half"
+    assert not Segmenter(exported).cut_by_quality
     shape = [d.dim_param or d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
     assert shape == ["batch", "height", "width", 3]
     assert [output.name for output in model.graph.output] == list(signature.OUTPUTS)

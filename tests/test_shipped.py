@@ -36,6 +36,7 @@ def test_it_keeps_the_contract_and_is_small(name: str, canvas: tuple[int, int]) 
     segmenter = Segmenter(Path(name), threads=1)
     assert segmenter.class_names == ("person",)
     assert segmenter.canvas == canvas
+    assert segmenter.cut_by_quality
     assert model_path(name).stat().st_size < 10e6
     assert len(segmenter(np.zeros((480, 640, 3), np.uint8))) == 0
 

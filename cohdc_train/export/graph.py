@@ -77,7 +77,12 @@ def _metadata(network: MaskRCNN, class_names: list[str]) -> dict[str, str]:
         "canvas": list(config.canvas),
         "resize": "inside: fitted into the canvas, bilinear, antialiased, top left, black padding",
     }
-    thresholds = {"score": config.score_threshold, "nms_iou": config.nms_iou, "mask": MASK_THRESHOLD}
+    thresholds = {
+        "score": config.score_threshold,
+        "nms_iou": config.nms_iou,
+        "mask": MASK_THRESHOLD,
+        "mask_cut": config.mask_cut,
+    }
     return {
         signature.KEY_CONTRACT: str(signature.CONTRACT_VERSION),
         signature.KEY_VERSION: __version__,

@@ -40,6 +40,11 @@ class Segmenter:
             of a network that comes with the package: "person".
         threads: onnxruntime's threads inside an operator; 0 leaves it to onnxruntime.
 
+    Attributes:
+        class_names: name per label.
+        canvas: (height, width) px that images are fitted into; None where they go in as they are.
+        cut_by_quality: the masks of a doubtful contour have its doubtful rim (`models.inference.cut_by_quality`).
+
     Raises:
         ContractError: there is no such file, it is not ONNX, or it keeps neither the contract nor a foreign layout.
     """
@@ -53,6 +58,7 @@ class Segmenter:
         self._graph = graph
         self.class_names = graph.class_names
         self.canvas = graph.canvas
+        self.cut_by_quality = json.loads(metadata.get(signature.KEY_THRESHOLDS, "{}")).get("mask_cut") == "quality"
 
     def __call__(self, rgb: Image) -> Detections:
         """rgb: uint8 [H, W, 3]. Returns what the file finds at its own score threshold, rows falling by score."""

@@ -1,7 +1,7 @@
 """Masks of what moves: from a segmenter's ONNX or a folder of PNGs, dilated, True = dynamic."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -28,19 +28,20 @@ class Culling:
         quality: detections below this CQE quality are ignored; the paper's filter is 0.9. A contour left out is a
             person left in: by default none is.
         dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (1 + doubt * (1 - q)).
-        doubt: how much more a contour grows that CQE trusts not at all; at 0 all grow alike.
+        doubt: how much more a contour grows that CQE trusts not at all; at 0 all grow alike. When not given, 1, or 0
+            for a network whose masks are cut by quality: a doubtful contour has its doubtful rim already.
     """
 
     dynamic_classes: list[str] | None = None
     score: float = 0.5
     quality: float = 0.0
     dilate: int = 10
-    doubt: float = 1.0
+    doubt: float | None = None
 
     def __post_init__(self) -> None:
         if self.dilate < 0:
             raise DataError(f"dilate is {self.dilate}; it cannot be below 0")
-        if not 0 <= self.doubt < float("inf"):
+        if self.doubt is not None and not 0 <= self.doubt < float("inf"):
             raise DataError(f"doubt is {self.doubt:g}; it cannot be below 0 or infinite")
         for name in ("score", "quality"):
             if not 0 <= getattr(self, name) <= 1:
@@ -87,7 +88,8 @@ def dynamic_objects(detections: Detections, labels: frozenset[int], culling: Cul
 
 def growth(culling: Culling, quality: float) -> float:
     """By how many px a contour of a CQE quality grows."""
-    return culling.dilate * (1.0 + culling.doubt * (1.0 - min(max(quality, 0.0), 1.0)))
+    doubt = 1.0 if culling.doubt is None else culling.doubt
+    return culling.dilate * (1.0 + doubt * (1.0 - min(max(quality, 0.0), 1.0)))
 
 
 def no_masks(view: View) -> Mask | None:
@@ -122,7 +124,8 @@ class ModelMasks:
         if unknown:
             raise DataError(f"dynamic class {unknown[0]!r} is not one of the model's: {', '.join(names)}")
         self._labels = frozenset(names.index(name) for name in wanted)
-        self._segmenter, self._culling = segmenter, culling
+        self._segmenter = segmenter
+        self._culling = replace(culling, doubt=0.0) if culling.doubt is None and segmenter.cut_by_quality else culling
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool."""

@@ -67,7 +67,7 @@ def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequenc
     assert rows[0]["keyframe"] == "1"
     assert all(0.2 < float(row["culled_share"]) < 0.6 for row in rows)
     config = yaml.safe_load((masked / "config.yaml").read_text())
-    assert config["culling"] == {"dynamic_classes": None, "score": 0.5, "quality": 0.0, "dilate": 7, "doubt": 1.0}
+    assert config["culling"] == {"dynamic_classes": None, "score": 0.5, "quality": 0.0, "dilate": 7, "doubt": None}
     assert config["camera"]["fx"] == 260
     assert config["seed"] == 1
 
@@ -171,12 +171,16 @@ class TwoClasses:
 
     class_names = ("person", "chair")
 
+    def __init__(self, quality: float = 1.0, cut_by_quality: bool = False) -> None:
+        self.quality = np.full(1, quality, dtype=np.float32)
+        self.cut_by_quality = cut_by_quality
+
     def __call__(self, rgb: np.ndarray) -> Detections:
         height, width = rgb.shape[:2]
         box = np.array([[0, 0, width / 2, height]], dtype=np.float32)
         one = np.ones(1, dtype=np.float32)
         mask = np.ones((1, 28, 28), dtype=np.float32)
-        return Detections(box, np.zeros(1, dtype=np.int64), one, one, mask, (height, width), self.class_names)
+        return Detections(box, np.zeros(1, dtype=np.int64), one, self.quality, mask, (height, width), self.class_names)
 
 
 def test_a_model_masks_the_classes_that_are_asked_for() -> None:
@@ -187,6 +191,18 @@ def test_a_model_masks_the_classes_that_are_asked_for() -> None:
     assert not chairs(view).any()
     with pytest.raises(DataError, match="'dog' is not one of the model's: person, chair"):
         ModelMasks(model, Culling(dynamic_classes=["dog"]))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("cut_by_quality", "doubt", "px"), [(False, None, 20), (True, None, 10), (True, 1.0, 20), (False, 0.0, 10)]
+)
+def test_a_doubtful_contour_grows_more_unless_its_cut_has_seen_to_that(
+    cut_by_quality: bool, doubt: float | None, px: int
+) -> None:
+    view = View(0.0, "0", "0", np.zeros((240, 320, 3), dtype=np.uint8), np.zeros((240, 320), dtype=np.float32))
+    masks = ModelMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
+    assert masks(view)[120].sum() == 160 + px
+    assert masks.outline(view)[1] == px
 
 
 def test_torch_is_never_imported() -> None:
