@@ -17,8 +17,8 @@ from cohdc_train.slam.rigidity import pose_of_rest
 LOCAL_KEYFRAMES = 15
 _MIN_FIRST = 15  # inliers of the first, rough pose
 _MIN_TRACKED = 25  # inliers of the pose against the local map
-_AS_BEFORE = 0.7  # of the last frame's matches: where a pose that was only expected finds fewer, it is not believed
 _MIN_FOUND_AGAIN = 40  # the same when the place was lost
+_AS_BEFORE = 0.7  # of the last frame's matches: where a pose that was only expected finds fewer, it is not believed
 _CANDIDATES = 6  # keyframes tried per lost frame
 
 
