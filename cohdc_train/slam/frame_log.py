@@ -32,17 +32,28 @@ class FrameLog:
         relative = fit.T_cw @ inverse(reference.T_cw)
         self._frames.append(_Logged(t, reference.index, relative, fit.information, fit.pull))
 
-    def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
-        """Each frame re-derived from its reference keyframe, or that one's heir, as the map has it now.
+    @property
+    def stamps(self) -> Array:
+        """[n] s."""
+        return np.array([frame.t for frame in self._frames])
 
-        Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
-        """
-        stamps = np.array([frame.t for frame in self._frames])
-        if not self._frames:
-            return stamps, np.zeros((0, 4, 4))
-        keyframes = {index: world.pose(index) for index in {frame.reference for frame in self._frames}}
-        poses = np.stack([frame.relative @ keyframes[frame.reference] for frame in self._frames])
-        if smooth:
+    def poses(self, world: Map) -> Array:
+        """[n, 4, 4] T_cw world to camera, m: each frame re-derived from its reference keyframe, or that one's heir, as
+        the map has it now."""
+        references = [frame.reference for frame in self._frames]
+        keyframes = {index: world.pose(index) for index in set(references)}
+        poses = [frame.relative @ keyframes[frame.reference] for frame in self._frames]
+        return np.stack(poses) if poses else np.zeros((0, 4, 4))
+
+    def put(self, world: Map, poses: Array) -> None:
+        """The frames are at poses [n, 4, 4] T_cw, m, in the map as it is now."""
+        for row, (frame, pose) in enumerate(zip(self._frames, poses, strict=True)):
+            self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
+
+    def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
+        """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has them now."""
+        stamps, poses = self.stamps, self.poses(world)
+        if smooth and len(poses):
             information = np.stack([frame.information for frame in self._frames])
             poses = smoothed(stamps, poses, information, np.stack([frame.pull for frame in self._frames]))
         return stamps, inverse(poses)

@@ -44,9 +44,9 @@ class Keyframe:
         return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
 
 
-def observations(features: Features, corners: NDArray[np.int64], trust: Array | float = 1.0) -> Observations:
-    """What a frame measured at some of its corners; trust: [n] weight of each, as Map.trust gives it."""
-    sigmas, depth_sigmas = features.sigmas[corners] / np.sqrt(trust), features.scales[corners] / np.sqrt(trust)
+def observations(features: Features, corners: NDArray[np.int64]) -> Observations:
+    """What a frame measured at some of its corners."""
+    sigmas, depth_sigmas = features.sigmas[corners], features.scales[corners]
     return Observations(features.points[corners], features.depths[corners], sigmas, depth_sigmas)
 
 
@@ -165,7 +165,7 @@ class Map:
 
     def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
         """Where the map has the matched points, [m, 3] m, and what a frame measured of them."""
-        seen = observations(features, matches.corners, self.trust(matches.points))
+        seen = observations(features, matches.corners).trusted(self.trust(matches.points))
         return self.positions[matches.points], seen
 
     def judge(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:

@@ -15,6 +15,7 @@ class Method:
             masked thing that has stood still for two seconds is of use until it moves.
         static_weights: groups of points that do not move with the rest are left out, and count less from then on.
         global_adjustment: when the sequence is over, all keyframes are bundle-adjusted at once.
+        every_frame: in that adjustment what frames between keyframes saw counts as well.
         smoothing: when the sequence is over, frames' poses are made to agree with how a hand moves, by what each saw.
         keyframe_culling: a keyframe leaves the map when three others see nine in ten of its points as well.
         flow: in real time two of three frames are tracked by optical flow from the third, which is matched to the map.
@@ -25,6 +26,7 @@ class Method:
     geometry: bool = True
     static_weights: bool = True
     global_adjustment: bool = True
+    every_frame: bool = True
     smoothing: bool = True
     keyframe_culling: bool = True
     flow: bool = True

@@ -46,10 +46,25 @@ class Observations:
         """The chosen rows."""
         return Observations(self.pixels[rows], self.depths[rows], self.sigmas[rows], self.depth_sigmas[rows])
 
+    def trusted(self, trust: Array) -> "Observations":
+        """The same of points that stand still with these probabilities, [m] above 0 up to 1: they weigh as much."""
+        share = np.sqrt(trust)
+        return Observations(self.pixels, self.depths, self.sigmas / share, self.depth_sigmas / share)
+
     @property
     def limits(self) -> Array:
         """[m] chi-square above which a measurement is an outlier at 5 %."""
         return np.where(np.isnan(self.depths), CHI2_PIXEL, CHI2_DEPTH)
+
+
+def joined(parts: list[Observations]) -> Observations:
+    """All measurements of some frames, in their order."""
+    return Observations(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.depths for part in parts]),
+        np.concatenate([part.sigmas for part in parts]),
+        np.concatenate([part.depth_sigmas for part in parts]),
+    )
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.dynamic_mask import DynamicMask
 from cohdc_train.slam.features import Corners, FeatureExtractor, Features, gray_of
+from cohdc_train.slam.final_adjustment import SeenFrames
 from cohdc_train.slam.flow_tracking import FlowTracker
 from cohdc_train.slam.frame_log import FrameLog
 from cohdc_train.slam.geometry import Geometry
@@ -26,7 +27,6 @@ from cohdc_train.slam.motion import Expectation, Motion
 from cohdc_train.slam.optimization import Array, Weighing, exp_se3, inverse
 from cohdc_train.slam.refinement import Refiner
 from cohdc_train.slam.shutter import unrolled
-from cohdc_train.slam.window import adjust_everything
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
@@ -92,6 +92,7 @@ class Tracker:
         self._reference_inliers = 0
         self._since_keyframe = 0
         self._log = FrameLog()
+        self._seen = SeenFrames()
 
     def track(
         self,
@@ -149,7 +150,7 @@ class Tracker:
         if self._mapper is not None:
             self._mapper.finish(self.map)
         if self.method.global_adjustment and len(self.map.keyframes) > 1:
-            adjust_everything(self.map, self._weighing)
+            self._seen.adjust(self.map, self._weighing, self._log)
 
     @property
     def loops(self) -> int:
@@ -271,6 +272,8 @@ class Tracker:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
         self._log.append(t, fit, fit.reference)
+        if matched and self.method.every_frame and self.features is not None:
+            self._seen.append(t, fit, fit.reference, self.features, self.map)
 
 
 def _fit_of(keyframe: Keyframe, information: Array) -> Fit:

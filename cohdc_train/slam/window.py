@@ -3,6 +3,7 @@
 The middle step touches no map, so it may run elsewhere and later (`background_mapping`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.bundle_adjustment import Problem, adjust, measurement_chi2
 from cohdc_train.slam.map import Keyframe, Map, observations
-from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse, to_local
+from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse, joined, to_local
 
 WINDOW = 12  # keyframes in local bundle adjustment
 FIXED = 3  # of them hold still and carry the frame of reference
@@ -20,8 +21,9 @@ FIXED = 3  # of them hold still and carry the frame of reference
 class Window:
     """What a bundle adjustment starts from.
 
-    keyframes: [c] the newest last; poses: [c, 4, 4] T_cw, m, as they were; ids: [p] map points; points: [p, 3] world,
-    m, as they were; problem: m measurements; corners: [m] the keyframe's corner behind each.
+    keyframes: [k] the newest last; poses: [c, 4, 4] T_cw, m, as they were, of the keyframes and then of c - k other
+    frames; ids: [p] map points; points: [p, 3] world, m, as they were; problem: m measurements; corners: [m] the
+    keyframe's corner behind each, or the other frame's row.
     """
 
     keyframes: list[Keyframe]
@@ -30,6 +32,16 @@ class Window:
     points: Array
     problem: Problem
     corners: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What a frame that is no keyframe saw. T_cw: [4, 4] world to camera, m; ids: [m] map points, none of them twice;
+    seen: the m measurements, as of points that surely stand still."""
+
+    T_cw: Array
+    ids: NDArray[np.int64]
+    seen: Observations
 
 
 @dataclass(frozen=True)
@@ -48,31 +60,33 @@ def open_window(world: Map, keyframe: Keyframe) -> Window:
     return _window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
 
 
-def adjust_everything(world: Map, weighing: Weighing) -> None:
-    """Bundle-adjust all keyframes and points at once; the first keyframe holds still."""
-    window = _window(world, list(world.keyframes), 1)
-    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))
+def adjust_everything(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> Array:
+    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first keyframe holds
+    still. Returns [s, 4, 4] T_cw of those frames, m."""
+    window = _window(world, list(world.keyframes), 1, sightings)
+    solution = solve(np.stack(window.poses), window.points, window.problem, weighing)
+    close_window(world, window, solution)
+    return solution.poses[len(window.keyframes) :]
 
 
-def _window(world: Map, keyframes: list[Keyframe], fixed: int) -> Window:
+def _window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()) -> Window:
     """Keyframes, the newest last, of which the first few are fixed, with all measurements of the others' points."""
     ids = world.points_of(keyframes[fixed:])
     row = np.full(world.size + 1, -1)
     row[ids] = np.arange(len(ids))
-    corners = [np.flatnonzero(row[k.point_ids] >= 0) for k in keyframes]
-    seen = [observations(k.features, c, world.trust(k.point_ids[c])) for k, c in zip(keyframes, corners, strict=True)]
+    named = [k.point_ids for k in keyframes] + [s.ids for s in sightings]
+    corners = [np.flatnonzero(row[points] >= 0) for points in named]
+    points = [row[all_of_them[c]] for all_of_them, c in zip(named, corners, strict=True)]
+    seen = [observations(k.features, c) for k, c in zip(keyframes, corners, strict=False)]
+    seen += [s.seen.take(c) for s, c in zip(sightings, corners[len(keyframes) :], strict=True)]
+    rows = np.concatenate(points)
     problem = Problem(
-        cameras=np.repeat(np.arange(len(keyframes)), [len(c) for c in corners]),
-        points=np.concatenate([row[k.point_ids[c]] for k, c in zip(keyframes, corners, strict=True)]),
-        seen=Observations(
-            np.concatenate([s.pixels for s in seen]),
-            np.concatenate([s.depths for s in seen]),
-            np.concatenate([s.sigmas for s in seen]),
-            np.concatenate([s.depth_sigmas for s in seen]),
-        ),
-        free=np.arange(len(keyframes)) >= fixed,
+        cameras=np.repeat(np.arange(len(corners)), [len(c) for c in corners]),
+        points=rows,
+        seen=joined(seen).trusted(world.trust(ids)[rows]),
+        free=np.arange(len(corners)) >= fixed,
     )
-    poses = [k.T_cw for k in keyframes]
+    poses = [k.T_cw for k in keyframes] + [s.T_cw for s in sightings]
     return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(corners))
 
 
@@ -93,10 +107,11 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
     Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and nothing is done, when
     somebody else moved one of the keyframes in the meantime (a loop was closed).
     """
-    if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=True)):
+    if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=False)):
         return None
-    motion: Array = inverse(window.poses[-1]) @ solution.poses[-1]
-    newest = window.keyframes[-1].index
+    last = len(window.keyframes) - 1
+    motion: Array = inverse(window.poses[last]) @ solution.poses[last]
+    newest = window.keyframes[last].index
     for keyframe in world.keyframes:
         if keyframe.index > newest:
             keyframe.T_cw = keyframe.T_cw @ motion

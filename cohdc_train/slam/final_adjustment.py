@@ -1,0 +1,78 @@
+"""The adjustment when a sequence is over: all keyframes, and what frames between them saw.
+
+A keyframe every half second is what mapping has time for while the camera moves. When it stands, the frames between
+have seen every point ten times more often.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.features import Features
+from cohdc_train.slam.frame_log import FrameLog
+from cohdc_train.slam.localization import Fit
+from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse
+from cohdc_train.slam.window import Sighting, adjust_everything
+
+_MOST = 256  # frames, about 60 kB each; when there are more, every other one goes
+
+
+class _Kept(NamedTuple):
+    """t: s; reference: index of a keyframe; relative: [4, 4] T of the frame in it, m; ids: [m] points that it saw;
+    born: [m] keyframe index of each, for a younger point may take the row of one that is gone; seen: measurements."""
+
+    t: float
+    reference: int
+    relative: Array
+    ids: NDArray[np.int64]
+    born: NDArray[np.int64]
+    seen: Observations
+
+
+class SeenFrames:
+    """Frames that were matched against the map, evenly thinned: so many are kept that memory is bounded."""
+
+    def __init__(self) -> None:
+        self._kept: list[_Kept] = []
+        self._every = 1
+        self._count = 0
+
+    def append(self, t: float, fit: Fit, reference: Keyframe, features: Features, world: Map) -> None:
+        """The settled frame at t, s, after those before it, and its corners."""
+        self._count += 1
+        if (self._count - 1) % self._every:
+            return
+        ids, relative = fit.matches.points, fit.T_cw @ inverse(reference.T_cw)
+        seen = observations(features, fit.matches.corners)
+        self._kept.append(_Kept(t, reference.index, relative, ids, world.born[ids], seen))
+        if len(self._kept) > _MOST:
+            self._kept = self._kept[::2]
+            self._every *= 2
+
+    def adjust(self, world: Map, weighing: Weighing, log: FrameLog) -> None:
+        """Bundle-adjust the whole map by these frames and its keyframes; all of the log go with the nearest of them."""
+        keyframes = {keyframe.t for keyframe in world.keyframes}
+        others = [kept for kept in self._kept if kept.t not in keyframes]
+        sightings = [_sighting(kept, world) for kept in others]
+        before = log.poses(world)
+        stamps = np.array([k.t for k in world.keyframes] + [kept.t for kept in others])
+        were = np.stack([k.T_cw for k in world.keyframes] + [s.T_cw for s in sightings])
+        poses = adjust_everything(world, weighing, sightings)
+        moved = inverse(were) @ np.concatenate([np.stack([k.T_cw for k in world.keyframes]), poses])
+        log.put(world, before @ moved[_nearest(log.stamps, stamps)])
+
+
+def _sighting(kept: _Kept, world: Map) -> Sighting:
+    """What a frame saw of points that are still there."""
+    there = np.flatnonzero((world.born[kept.ids] == kept.born) & (world.seen_by[kept.ids] > 0))
+    return Sighting(kept.relative @ world.pose(kept.reference), kept.ids[there], kept.seen.take(there))
+
+
+def _nearest(stamps: Array, others: Array) -> NDArray[np.int64]:
+    """[n] the row of others [m], s, in any order, that is nearest to each of stamps [n], s."""
+    order = np.argsort(others)
+    later = np.searchsorted(others[order], stamps).clip(1, len(others) - 1)
+    before, after = others[order[later - 1]], others[order[later]]
+    return np.asarray(order[np.where(stamps - before <= after - stamps, later - 1, later)])
