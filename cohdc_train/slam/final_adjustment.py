@@ -1,7 +1,7 @@
 """The adjustment when a sequence is over: all keyframes, and what frames between them saw.
 
-A keyframe every half second is what mapping has time for while the camera moves. When it stands, the frames between
-have seen every point ten times more often.
+A keyframe every half second is what mapping has time for on the way. The frames between have seen every point ten times
+more often.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class _Kept(NamedTuple):
 
 
 class SeenFrames:
-    """Frames that were matched against the map, evenly thinned: so many are kept that memory is bounded."""
+    """Frames by what they saw of the map, evenly thinned: so many are kept that memory is bounded."""
 
     def __init__(self) -> None:
         self._kept: list[_Kept] = []
@@ -52,13 +52,18 @@ class SeenFrames:
             self._every *= 2
 
     def adjust(self, world: Map, weighing: Weighing, log: FrameLog) -> None:
-        """Bundle-adjust the whole map by these frames and its keyframes; all of the log go with the nearest of them."""
+        """Bundle-adjust the whole map by its keyframes, and then by these frames as well; those of the log go with the
+        nearest of them.
+
+        Without the first step a map that loops have moved is still too far off when the few of the second are over.
+        """
+        before = log.poses(world)
         keyframes = {keyframe.t for keyframe in world.keyframes}
         others = [kept for kept in self._kept if kept.t not in keyframes]
+        were = np.stack([k.T_cw for k in world.keyframes] + [_pose(kept, world) for kept in others])
+        adjust_everything(world, weighing)
         sightings = [_sighting(kept, world) for kept in others]
-        before = log.poses(world)
         stamps = np.array([k.t for k in world.keyframes] + [kept.t for kept in others])
-        were = np.stack([k.T_cw for k in world.keyframes] + [s.T_cw for s in sightings])
         poses = adjust_everything(world, weighing, sightings)
         moved = inverse(were) @ np.concatenate([np.stack([k.T_cw for k in world.keyframes]), poses])
         log.put(world, before @ moved[_nearest(log.stamps, stamps)])
@@ -67,7 +72,12 @@ class SeenFrames:
 def _sighting(kept: _Kept, world: Map) -> Sighting:
     """What a frame saw of points that are still there."""
     there = np.flatnonzero((world.born[kept.ids] == kept.born) & (world.seen_by[kept.ids] > 0))
-    return Sighting(kept.relative @ world.pose(kept.reference), kept.ids[there], kept.seen.take(there))
+    return Sighting(_pose(kept, world), kept.ids[there], kept.seen.take(there))
+
+
+def _pose(kept: _Kept, world: Map) -> Array:
+    """T_cw [4, 4], m, as the map has it now."""
+    return np.asarray(kept.relative @ world.pose(kept.reference))
 
 
 def _nearest(stamps: Array, others: Array) -> NDArray[np.int64]:

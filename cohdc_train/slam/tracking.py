@@ -30,7 +30,7 @@ from cohdc_train.slam.shutter import unrolled
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
-_KEYFRAME_FRAMES = 20
+_KEYFRAME_FRAMES = 15
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
@@ -272,7 +272,7 @@ class Tracker:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
         self._log.append(t, fit, fit.reference)
-        if matched and self.method.every_frame and self.features is not None:
+        if self.method.every_frame and self.features is not None:
             self._seen.append(t, fit, fit.reference, self.features, self.map)
 
 
