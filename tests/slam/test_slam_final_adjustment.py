@@ -1,5 +1,7 @@
 """The adjustment at the end, in which frames between keyframes count: what it is worth, and what it may not do."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -74,7 +76,11 @@ def test_frames_that_are_not_adjusted_go_with_the_nearest_that_is(monkeypatch: p
     """The adjustment is a stand-in that moves everything by one motion: so must every frame move."""
     tracker, step = run(True), exp_se3(np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]))
 
-    def moves(world: object, weighing: object, sightings: list[final_adjustment.Sighting]) -> NDArray[np.float64]:
+    def moves(
+        world: object, weighing: object, sightings: Sequence[final_adjustment.Sighting] = ()
+    ) -> NDArray[np.float64]:
+        if not sightings:
+            return np.zeros((0, 4, 4))
         tracker.map.move(np.stack([k.T_cw for k in tracker.map.keyframes]) @ inverse(step))
         return np.stack([sighting.T_cw for sighting in sightings]) @ inverse(step)
 
