@@ -16,7 +16,8 @@ from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse
 from cohdc_train.slam.window import Sighting, adjust_everything
 
-_MOST = 256  # frames, about 60 kB each; when there are more, every other one goes
+_MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
+_TURNS = 2  # a frame gives only every second of its points, the next one the others: a quarter of the time
 
 
 class _Kept(NamedTuple):
@@ -44,8 +45,9 @@ class SeenFrames:
         self._count += 1
         if (self._count - 1) % self._every:
             return
-        ids, relative = fit.matches.points, fit.T_cw @ inverse(reference.T_cw)
-        seen = observations(features, fit.matches.corners)
+        relative = fit.T_cw @ inverse(reference.T_cw)
+        some = fit.matches.take((fit.matches.points + self._count // self._every) % _TURNS == 0)
+        ids, seen = some.points, observations(features, some.corners)
         self._kept.append(_Kept(t, reference.index, relative, ids, world.born[ids], seen))
         if len(self._kept) > _MOST:
             self._kept = self._kept[::2]
