@@ -17,7 +17,7 @@ from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse
 from cohdc_train.slam.window import Sighting, adjust_everything
 
 _MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
-_TURNS = 2  # a frame gives only every second of its points, the next one the others: a quarter of the time
+_TURNS = 2  # a frame gives only every second of its points, another one the others: a quarter of the time
 
 
 class _Kept(NamedTuple):
@@ -42,11 +42,12 @@ class SeenFrames:
 
     def append(self, t: float, fit: Fit, reference: Keyframe, features: Features, world: Map) -> None:
         """The settled frame at t, s, after those before it, and its corners."""
-        self._count += 1
-        if (self._count - 1) % self._every:
+        number, self._count = self._count, self._count + 1
+        if number % self._every:
             return
+        turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
         relative = fit.T_cw @ inverse(reference.T_cw)
-        some = fit.matches.take((fit.matches.points + self._count // self._every) % _TURNS == 0)
+        some = fit.matches.take((fit.matches.points + turn) % _TURNS == 0)
         ids, seen = some.points, observations(features, some.corners)
         self._kept.append(_Kept(t, reference.index, relative, ids, world.born[ids], seen))
         if len(self._kept) > _MOST:
