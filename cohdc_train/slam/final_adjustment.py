@@ -69,7 +69,7 @@ class SeenFrames:
         stamps = np.array([k.t for k in world.keyframes] + [kept.t for kept in others])
         poses = adjust_everything(world, weighing, sightings)
         moved = inverse(were) @ np.concatenate([np.stack([k.T_cw for k in world.keyframes]), poses])
-        log.put(world, before @ moved[_nearest(log.stamps, stamps)])
+        log.put(world, before @ moved[_nearest(log.stamps, stamps)], np.isin(log.stamps, stamps))
 
 
 def _sighting(kept: _Kept, world: Map) -> Sighting:

@@ -106,6 +106,14 @@ def test_frames_give_all_their_points_between_them(
     np.testing.assert_allclose(times, len(seen._kept) / 2, atol=1)
 
 
+def test_where_a_frame_is_by_what_it_saw_nothing_expected_is_taken_out() -> None:
+    """Where depth errs by 3 cm, few points agree, and a third of the frames were placed by what was expected as well."""
+    tracker = run(True, 0.03)
+    assert any(frame.pull.any() for frame in tracker._log._frames)
+    tracker.finish()
+    assert not any(frame.pull.any() for frame in tracker._log._frames)
+
+
 def test_a_row_that_a_younger_point_has_taken_says_nothing(tracker: Tracker) -> None:
     seen = SeenFrames()
     remember(seen, 0.0, tracker)
