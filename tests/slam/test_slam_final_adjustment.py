@@ -107,7 +107,7 @@ def test_frames_give_all_their_points_between_them(
 
 
 def test_where_a_frame_is_by_what_it_saw_nothing_expected_is_taken_out() -> None:
-    """Where depth errs by 3 cm, few points agree, and a third of the frames were placed by what was expected as well."""
+    """Where depth errs by 3 cm, few points agree: a third of the frames were placed by what was expected as well."""
     tracker = run(True, 0.03)
     assert any(frame.pull.any() for frame in tracker._log._frames)
     tracker.finish()
