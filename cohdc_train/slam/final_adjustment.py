@@ -41,7 +41,12 @@ class SeenFrames:
         self._count = 0
 
     def append(self, t: float, fit: Fit, reference: Keyframe, features: Features, world: Map) -> None:
-        """The settled frame at t, s, after those before it, and its corners."""
+        """The settled frame at t, s, after those before it, and its corners.
+
+        One that saw so little that it was placed by what was expected as well is not kept: what it saw would not do.
+        """
+        if fit.prior is not None:
+            return
         number, self._count = self._count, self._count + 1
         if number % self._every:
             return
@@ -69,7 +74,7 @@ class SeenFrames:
         stamps = np.array([k.t for k in world.keyframes] + [kept.t for kept in others])
         poses = adjust_everything(world, weighing, sightings)
         moved = inverse(were) @ np.concatenate([np.stack([k.T_cw for k in world.keyframes]), poses])
-        log.put(world, before @ moved[_nearest(log.stamps, stamps)], np.isin(log.stamps, stamps))
+        log.put(world, before @ moved[_nearest(log.stamps, stamps)])
 
 
 def _sighting(kept: _Kept, world: Map) -> Sighting:

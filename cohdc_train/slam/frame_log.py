@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.slam.localization import Fit
 from cohdc_train.slam.map import Keyframe, Map
@@ -46,12 +45,10 @@ class FrameLog:
         poses = [frame.relative @ keyframes[frame.reference] for frame in self._frames]
         return np.stack(poses) if poses else np.zeros((0, 4, 4))
 
-    def put(self, world: Map, poses: Array, seen: NDArray[np.bool_]) -> None:
-        """The frames are at poses [n, 4, 4] T_cw, m, in the map as it is now. seen: [n] bool, those that are there by
-        what they saw alone, whatever was expected of them."""
+    def put(self, world: Map, poses: Array) -> None:
+        """The frames are at poses [n, 4, 4] T_cw, m, in the map as it is now."""
         for row, (frame, pose) in enumerate(zip(self._frames, poses, strict=True)):
-            pull = np.zeros(6) if seen[row] else frame.pull
-            self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)), pull=pull)
+            self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
 
     def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
         """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has them now."""

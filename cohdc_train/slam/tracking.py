@@ -30,7 +30,8 @@ from cohdc_train.slam.shutter import unrolled
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
-_KEYFRAME_FRAMES = 15
+_KEYFRAME_FRAMES = 20
+_KEYFRAME_FRAMES_FLOW = 15  # where only every third frame can become one
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
@@ -233,7 +234,7 @@ class Tracker:
         old = self.map.born[: self.map.size] < self.map.joined - _OLD
         if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
             return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
-        if self._since_keyframe >= _KEYFRAME_FRAMES:
+        if self._since_keyframe >= (_KEYFRAME_FRAMES if self._flow is None else _KEYFRAME_FRAMES_FLOW):
             return True
         return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
 
