@@ -13,6 +13,7 @@ from cohdc_train.slam.features import Features
 from cohdc_train.slam.frame_log import FrameLog
 from cohdc_train.slam.localization import Fit
 from cohdc_train.slam.map import Keyframe, Map, observations
+from cohdc_train.slam.motion import FEW
 from cohdc_train.slam.optimization import Array, Observations, Weighing, inverse
 from cohdc_train.slam.window import Sighting, adjust_everything
 
@@ -43,9 +44,9 @@ class SeenFrames:
     def append(self, t: float, fit: Fit, reference: Keyframe, features: Features, world: Map) -> None:
         """The settled frame at t, s, after those before it, and its corners.
 
-        One that saw so little that it was placed by what was expected as well is not kept: what it saw would not do.
+        One that saw little is not kept: what it gives would not do for a pose.
         """
-        if fit.prior is not None:
+        if len(fit.matches) < _TURNS * FEW:
             return
         number, self._count = self._count, self._count + 1
         if number % self._every:

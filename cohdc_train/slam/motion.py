@@ -16,7 +16,7 @@ _EXACT = np.full(6, 1e-4)  # m and rad: no pose is known better, however many po
 LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
 SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
 _PAUSE = 10.0  # s, after which nothing more is forgotten
-_FEW = 150  # points of a frame, below which it matters where the camera was expected
+FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
 _NOTHING = np.zeros(6)
 _SURPRISE = 100.0  # squared standard deviations of a pose, from which on it is a leap
@@ -31,7 +31,7 @@ class Expectation:
 
     def given(self, points: int) -> Prior | None:
         """What counts beside so many points that a frame sees: nothing where they suffice, or the camera is shaken."""
-        return self.prior if self.calm and points < _FEW else None
+        return self.prior if self.calm and points < FEW else None
 
 
 class Motion:

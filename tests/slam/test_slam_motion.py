@@ -208,8 +208,8 @@ def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(monkeypatch: pytes
     almost_all = np.ones((240, 320), dtype=np.bool_)
     almost_all[150:, 230:] = False
     errors = {}
-    for few in (0, motion_module._FEW):
-        monkeypatch.setattr(motion_module, "_FEW", few)
+    for few in (0, motion_module.FEW):
+        monkeypatch.setattr(motion_module, "FEW", few)
         tracker = Tracker(CAMERA, features=200, method=Method(smoothing=False, refinement=False))
         poses = [
             tracker.track(rgb, depth, k / 30, almost_all if k >= 10 else None)
@@ -218,4 +218,4 @@ def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(monkeypatch: pytes
         assert all(0 < pose.inliers < 150 for pose in poses[10:]), [p.inliers for p in poses[10:]]
         way = Trajectory(*tracker.trajectory())
         errors[few] = score(Trajectory(np.arange(len(path)) / 30, path), way)["ate_m"]["rmse"]
-    assert errors[motion_module._FEW] < 0.7 * errors[0], errors
+    assert errors[motion_module.FEW] < 0.7 * errors[0], errors
