@@ -40,7 +40,7 @@ def module_of(config: NetworkConfig, names: list[str]) -> MaskRCNNModule:
     return MaskRCNNModule(names, config).eval()
 
 
-@pytest.fixture(scope="module", params=["resnet", "mobilenet_v2"])
+@pytest.fixture(scope="module", params=[pytest.param("resnet", marks=pytest.mark.slow), "mobilenet_v2"])
 def network(request: pytest.FixtureRequest, opinionated: MaskRCNN) -> MaskRCNN:
     options: dict[str, Any] = {"norm": "frozen", "backbone": request.param, "score_threshold": 0.05}
     options |= {} if request.param == "resnet" else {"width": 1.0, "rates": ((1,), (1,), (1, 2), (1, 2, 3))}
