@@ -65,6 +65,7 @@ class SeenFrames:
         nearest of them.
 
         Without the first step a map that loops have moved is still too far off when the few of the second are over.
+        Where no frame was kept it is all that is done, and those of the log go with their reference keyframes.
         """
         before = log.poses(world)
         keyframes = {keyframe.t for keyframe in world.keyframes}
@@ -72,6 +73,8 @@ class SeenFrames:
         were = np.stack([k.T_cw for k in world.keyframes] + [_pose(kept, world) for kept in others])
         adjust_everything(world, weighing)
         sightings = [_sighting(kept, world) for kept in others]
+        if not sightings:
+            return
         stamps = np.array([k.t for k in world.keyframes] + [kept.t for kept in others])
         poses = adjust_everything(world, weighing, sightings)
         moved = inverse(were) @ np.concatenate([np.stack([k.T_cw for k in world.keyframes]), poses])

@@ -160,6 +160,21 @@ def test_a_map_of_one_keyframe_is_left_alone() -> None:
     np.testing.assert_array_equal(tracker.trajectory()[1], before)
 
 
+def test_without_frames_the_keyframes_are_adjusted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, asked = run(), []
+
+    def counts(world: object, weighing: object, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
+        asked.append(len(sightings))
+        return np.zeros((0, 4, 4))
+
+    monkeypatch.setattr(final_adjustment, "adjust_everything", counts)
+    tracker._seen = SeenFrames()
+    before = tracker.trajectory()[1]
+    tracker.finish()
+    assert asked == [0]
+    np.testing.assert_array_equal(tracker.trajectory()[1], before)
+
+
 def test_nearest_by_hand() -> None:
     others = np.array([5.0, 1.0, 3.0])
     np.testing.assert_array_equal(_nearest(np.array([0.0, 1.9, 2.1, 3.9, 4.1, 9.0]), others), [1, 1, 2, 2, 0, 0])
