@@ -1,5 +1,6 @@
 """Every tracked frame, by where it lies from a keyframe: keyframes move later on, and take it along."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,10 +28,11 @@ class FrameLog:
     def __init__(self) -> None:
         self._frames: list[_Logged] = []
 
-    def append(self, t: float, fit: Fit, reference: Keyframe) -> None:
-        """The frame at t, s, after those before it."""
+    def append(self, t: float, fit: Fit, reference: Keyframe) -> int:
+        """The frame at t, s, after those before it. Returns its row."""
         relative = fit.T_cw @ inverse(reference.T_cw)
         self._frames.append(_Logged(t, reference.index, relative, fit.information, fit.pull))
+        return len(self._frames) - 1
 
     @property
     def stamps(self) -> Array:
@@ -45,9 +47,10 @@ class FrameLog:
         poses = [frame.relative @ keyframes[frame.reference] for frame in self._frames]
         return np.stack(poses) if poses else np.zeros((0, 4, 4))
 
-    def put(self, world: Map, poses: Array) -> None:
-        """The frames are at poses [n, 4, 4] T_cw, m, in the map as it is now."""
-        for row, (frame, pose) in enumerate(zip(self._frames, poses, strict=True)):
+    def put(self, world: Map, rows: Sequence[int], poses: Array) -> None:
+        """The frames in rows [m] are at poses [m, 4, 4] T_cw, m, in the map as it is now."""
+        for row, pose in zip(rows, poses, strict=True):
+            frame = self._frames[row]
             self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
 
     def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:

@@ -272,9 +272,9 @@ class Tracker:
         if self._since_keyframe > 0 and matched:
             self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
-        self._log.append(t, fit, fit.reference)
+        row = self._log.append(t, fit, fit.reference)
         if self.method.every_frame and self.features is not None:
-            self._seen.append(t, fit, fit.reference, self.features, self.map)
+            self._seen.append(row, fit, self.features, self.map)
 
 
 def _fit_of(keyframe: Keyframe, information: Array) -> Fit:

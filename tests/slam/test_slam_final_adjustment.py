@@ -10,7 +10,7 @@ from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam import final_adjustment
 from cohdc_train.slam.features import Features
-from cohdc_train.slam.final_adjustment import SeenFrames, _nearest
+from cohdc_train.slam.final_adjustment import SeenFrames
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.motion import FEW
 from cohdc_train.slam.optimization import Weighing, exp_se3, inverse, to_local
@@ -69,44 +69,48 @@ def tracker() -> Tracker:
     return run()
 
 
-def remember(seen: SeenFrames, t: float, tracker: Tracker) -> None:
-    """The tracker's latest frame, as one at t."""
-    fit = tracker._last
-    assert fit is not None
-    assert fit.reference is not None
+def remember(seen: SeenFrames, row: int, tracker: Tracker) -> None:
+    """The tracker's latest frame, as one in that row of the log."""
+    assert tracker._last is not None
     assert tracker.features is not None
-    seen.append(t, fit, fit.reference, tracker.features, tracker.map)
+    seen.append(row, tracker._last, tracker.features, tracker.map)
 
 
 def test_memory_is_bounded_and_what_is_kept_lies_evenly(tracker: Tracker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(final_adjustment, "_MOST", 20)
     seen = SeenFrames()
-    for number in range(1000):
-        remember(seen, number / 30, tracker)
+    for row in range(1000):
+        remember(seen, row, tracker)
         assert len(seen._kept) <= 20
-    stamps = np.array([kept.t for kept in seen._kept])
-    assert len(stamps) >= 10
-    np.testing.assert_allclose(np.diff(stamps), stamps[1] - stamps[0], atol=1e-9)
-    assert stamps[0] == 0
-    assert stamps[-1] > 30, "the latest frames are among them"
+    rows = np.array([kept.row for kept in seen._kept])
+    assert len(rows) >= 10
+    np.testing.assert_array_equal(np.diff(rows), rows[1] - rows[0])
+    assert rows[0] == 0
+    assert rows[-1] > 900, "the latest frames are among them"
 
 
-def test_frames_that_are_not_adjusted_go_with_the_nearest_that_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The adjustment is a stand-in that moves everything by one motion: so must every frame move."""
-    tracker, step = run(), exp_se3(np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]))
+def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adjustment is a stand-in that moves keyframes by one motion and frames by another."""
+    monkeypatch.setattr(final_adjustment, "_MOST", 10)
+    tracker = run()
+    kept = [frame.row for frame in tracker._seen._kept]
+    step, further = np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]), np.array([0.0, 0.03, 0.01, 0.0, 0.02, 0.0])
 
-    def moves(
-        world: object, weighing: object, sightings: Sequence[final_adjustment.Sighting] = ()
-    ) -> NDArray[np.float64]:
+    def moves(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
         if not sightings:
-            return np.zeros((0, 4, 4))
-        tracker.map.move(np.stack([k.T_cw for k in tracker.map.keyframes]) @ inverse(step))
-        return np.stack([sighting.T_cw for sighting in sightings]) @ inverse(step)
+            world.move(np.stack([k.T_cw for k in world.keyframes]) @ inverse(exp_se3(step)))
+        poses = [exp_se3(further) @ sighting.T_cw for sighting in sightings]
+        return np.stack(poses) if poses else np.zeros((0, 4, 4))
 
     monkeypatch.setattr(final_adjustment, "adjust_everything", moves)
-    before = tracker.trajectory()[1]
+    before = tracker._log.poses(tracker.map)
+    keyframes = np.isin(tracker._log.stamps, [keyframe.t for keyframe in tracker.map.keyframes])
     tracker.finish()
-    np.testing.assert_allclose(tracker.trajectory()[1], step @ before, atol=1e-9)
+    wanted = before @ inverse(exp_se3(step))
+    rows = [row for row in kept if not keyframes[row]]
+    assert 0 < len(rows) < np.count_nonzero(~keyframes)
+    wanted[rows] = exp_se3(further) @ wanted[rows]
+    np.testing.assert_allclose(tracker._log.poses(tracker.map), wanted, atol=1e-9)
 
 
 @pytest.mark.parametrize("frames", [2, 1000])
@@ -117,8 +121,8 @@ def test_frames_give_all_their_points_between_them(
     monkeypatch.setattr(final_adjustment, "_MOST", 20)
     assert tracker._last is not None
     points, seen = tracker._last.matches.points, SeenFrames()
-    for number in range(frames):
-        remember(seen, number / 30, tracker)
+    for row in range(frames):
+        remember(seen, row, tracker)
     for kept in seen._kept:
         assert 0.4 * len(points) < len(kept.ids) < 0.6 * len(points)
     times = np.bincount(np.concatenate([kept.ids for kept in seen._kept]), minlength=tracker.map.size)[points]
@@ -126,25 +130,23 @@ def test_frames_give_all_their_points_between_them(
 
 
 def test_a_frame_that_saw_little_is_not_kept(tracker: Tracker) -> None:
-    fit = tracker._last
+    fit, seen = tracker._last, SeenFrames()
     assert fit is not None
-    assert fit.reference is not None
     assert tracker.features is not None
-    seen = SeenFrames()
     for points in (2 * FEW - 1, 2 * FEW):
         few = replace(fit, matches=fit.matches.take(np.arange(points)))
-        seen.append(0.0, few, fit.reference, tracker.features, tracker.map)
+        seen.append(0, few, tracker.features, tracker.map)
     assert len(seen._kept) == 1
 
 
 def test_a_row_that_a_younger_point_has_taken_says_nothing(tracker: Tracker) -> None:
     seen = SeenFrames()
-    remember(seen, 0.0, tracker)
+    remember(seen, 0, tracker)
     ids = seen._kept[0].ids
     taken = ids[:5]
     before = tracker.map.born[taken].copy()
     tracker.map.born[taken] += 1
-    sighting = final_adjustment._sighting(seen._kept[0], tracker.map)
+    sighting = final_adjustment._sighting(seen._kept[0], np.eye(4), tracker.map)
     tracker.map.born[taken] = before
     assert set(sighting.ids.tolist()) == set(ids[5:].tolist())
     assert len(sighting.seen) == len(sighting.ids)
@@ -173,8 +175,3 @@ def test_without_frames_the_keyframes_are_adjusted_once(monkeypatch: pytest.Monk
     tracker.finish()
     assert asked == [0]
     np.testing.assert_array_equal(tracker.trajectory()[1], before)
-
-
-def test_nearest_by_hand() -> None:
-    others = np.array([5.0, 1.0, 3.0])
-    np.testing.assert_array_equal(_nearest(np.array([0.0, 1.9, 2.1, 3.9, 4.1, 9.0]), others), [1, 1, 2, 2, 0, 0])
