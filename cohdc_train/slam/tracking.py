@@ -29,9 +29,8 @@ from cohdc_train.slam.refinement import Refiner
 from cohdc_train.slam.shutter import unrolled
 
 MIN_START = 50  # points a first keyframe needs
-_KEYFRAME_SHARE = 0.75  # of the inliers right after the last keyframe
-_KEYFRAME_FRAMES = 20
-_KEYFRAME_FRAMES_FLOW = 15  # where only every third frame can become one
+_KEYFRAME = 0.82, 20  # share of the inliers right after the last keyframe, and frames since: one makes the next due
+_KEYFRAME_FLOW = 0.75, 15  # where only every third frame can become one, and time is short
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
@@ -234,9 +233,8 @@ class Tracker:
         old = self.map.born[: self.map.size] < self.map.joined - _OLD
         if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
             return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
-        if self._since_keyframe >= (_KEYFRAME_FRAMES if self._flow is None else _KEYFRAME_FRAMES_FLOW):
-            return True
-        return len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
+        share, frames = _KEYFRAME if self._flow is None else _KEYFRAME_FLOW
+        return self._since_keyframe >= frames or len(fit.matches) < share * self._reference_inliers
 
     def _add_keyframe(self, features: Features, fit: Fit, t: float, rgb: _Rgb, depth_m: _Depth) -> Fit:
         point_ids = np.full(len(features), -1)

@@ -29,7 +29,7 @@ def views() -> list[View]:
 
 def run(views: list[View], loops: bool) -> Run:
     """With corners on whole pixels, or it would not drift; the motion always starts from the latest frame's pose."""
-    tracker, poses = Tracker(CAMERA, features=250, method=Method(loops=loops, refinement=False)), []
+    tracker, poses = Tracker(CAMERA, features=200, method=Method(loops=loops, refinement=False)), []
     for index, (rgb, depth) in enumerate(views):
         poses.append(tracker.track(rgb, depth, index / 30))
         assert tracker._last is not None

@@ -210,7 +210,7 @@ def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(monkeypatch: pytes
     errors = {}
     for few in (0, motion_module.FEW):
         monkeypatch.setattr(motion_module, "FEW", few)
-        tracker = Tracker(CAMERA, features=200, method=Method(smoothing=False, refinement=False))
+        tracker = Tracker(CAMERA, features=120, method=Method(smoothing=False, refinement=False))
         poses = [
             tracker.track(rgb, depth, k / 30, almost_all if k >= 10 else None)
             for k, (rgb, depth, _) in enumerate(views)

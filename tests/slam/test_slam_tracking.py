@@ -81,7 +81,7 @@ def test_a_calm_camera_asks_the_map_at_once_and_a_jolted_one_first_guesses(monke
 def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Five are missing, in which the wall moves by 72 px: no place is looked up, for the motion says where to look."""
     path = exp_se3(np.outer(np.arange(13) - 5, [0.12, 0.0, 0.01, 0.0, 0.01, 0.0]))
-    tracker = Tracker(CAMERA, features=500)
+    tracker = Tracker(CAMERA, features=600)
 
     def lost(*_: object) -> None:
         raise AssertionError("the whole map is searched")

@@ -1,0 +1,34 @@
+"""Which young points stay in the map."""
+
+import numpy as np
+from plane_world import CAMERA
+
+from cohdc_train.slam.features import Features
+from cohdc_train.slam.map import Keyframe, Map
+from cohdc_train.slam.mapping import cull
+
+ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them
+
+
+def keyframe(index: int, point_ids: list[int]) -> Keyframe:
+    """One that looks at a wall 2 m away, a corner for each of four points; -1 where it does not see one."""
+    pixels, none = np.array([[100.0, 80.0], [200.0, 80.0], [100.0, 160.0], [200.0, 160.0]]), np.zeros(4, dtype=np.int64)
+    depths, precise = np.full(4, 2.0), np.zeros(4, dtype=np.bool_)
+    features = Features(pixels, pixels, none, np.zeros((4, 4), dtype=np.uint64), depths, precise)
+    picture = np.zeros((2, 2), dtype=np.float32)
+    return Keyframe(index, index / 3, np.eye(4), features, np.array(point_ids), picture, picture)
+
+
+def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
+    world = Map(CAMERA)
+    first, second = keyframe(0, [-1, -1, -1, -1]), keyframe(1, [-1, TWICE, RARELY_FOUND, -1])
+    world.add_keyframe(first)
+    world.add_points(first, np.array([ONCE, TWICE, RARELY_FOUND]))
+    world.add_keyframe(second)
+    world.add_points(second, np.array([YOUNG]))
+    world.visible[[TWICE, RARELY_FOUND]], world.found[[TWICE, RARELY_FOUND]] = 20, (5, 4)
+    cull(world, newest=2)
+    assert world.seen_by[: world.size].tolist() == [1, 2, 0, 1], "its time is not up"
+    cull(world, newest=3)
+    assert world.seen_by[: world.size].tolist() == [0, 2, 0, 1]
+    assert first.point_ids.tolist() == [-1, TWICE, -1, -1]
