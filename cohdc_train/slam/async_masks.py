@@ -38,6 +38,13 @@ class _Done:
     ms: float
 
 
+def widened(half: Mask, growth: float, age: float, view: View) -> Mask:
+    """[H, W] bool of a view, from a mask of half size that was carried to it for `age` s; growth: px, of a new one."""
+    height, width = view.rgb.shape[:2]
+    grown = grow(half, (growth + _WIDEN * age) / 2).astype(np.uint8)
+    return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+
+
 class AsyncMasks:
     """A mask for every frame from a segmenter that keeps up with only some.
 
@@ -85,9 +92,7 @@ class AsyncMasks:
         assert newest is not None
         age = view.t - newest.job.view.t
         self.ages.append(age)
-        height, width = view.rgb.shape[:2]
-        grown = grow(mask, (newest.growth + _WIDEN * age) / 2).astype(np.uint8)
-        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+        return widened(mask, newest.growth, age, view)
 
     def _take(self, done: _Done | None) -> None:
         if done is None:

@@ -1,0 +1,57 @@
+"""tools/late_masks: real time without a clock."""
+
+import json
+import sys
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from plane_world import write_sequence
+
+from cohdc_train.slam.run import slam
+from cohdc_train.slam.source import View
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    loader = SourceFileLoader("late_masks", str(Path(__file__).parents[2] / "tools" / "late_masks"))
+    module = module_from_spec(spec_from_loader(loader.name, loader) or pytest.fail("no tools/late_masks"))
+    sys.modules[loader.name] = module  # dataclasses look their module up
+    loader.exec_module(module)
+    return module
+
+
+def square(frame: int) -> NDArray[np.bool_]:
+    """Which frame a mask was made of shows in where it is."""
+    mask = np.zeros((240, 640), dtype=np.bool_)
+    mask[100:140, 60 * frame + 20 : 60 * frame + 60] = True
+    return mask
+
+
+@pytest.mark.parametrize(("late", "made_of"), [(0, range(8)), (2, [0, 0, 0, 1, 1, 3, 3, 5])])
+def test_a_mask_is_of_the_latest_frame_that_is_done(tool: ModuleType, late: int, made_of: list[int]) -> None:
+    """The picture stands still, so that a mask stays where it was made. The segmenter takes the next that comes."""
+    gray = np.random.default_rng(0).integers(0, 255, (240, 640, 1)).astype(np.uint8)
+    rgb, depth = gray.repeat(3, axis=2), np.full((240, 640), 2.0, dtype=np.float32)
+    masks = tool.LateMasks(lambda view: (square(int(view.name)), 0.0), late)
+    for frame, wanted in enumerate(made_of):
+        mask = masks(View(frame / 30, str(frame), str(frame), rgb, depth))
+        assert np.flatnonzero(mask[120, 40::60][:8]).tolist() == [wanted], frame
+
+
+def test_without_flow_and_in_time_it_is_the_synchronous_run(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = write_sequence(tmp_path / "plane", 12, with_passer_by=True)
+    words = ["--sequences", str(sequence), "--out", str(tmp_path / "out"), "--features", "400", "--late", "0", "2"]
+    monkeypatch.setattr(sys, "argv", ["late_masks", *words, "--method", "flow=false"])
+    tool.main()
+    rows = json.loads((tmp_path / "out" / "late_masks.json").read_text())
+    assert [(row["sequence"], row["late"], row["features"]) for row in rows] == [("plane", 0, 400), ("plane", 2, 400)]
+    run = slam(sequence=sequence, out=tmp_path / "run", masks=sequence / "masks", features=400)
+    assert rows[0]["ate_m"] == pytest.approx(run["ate_m"]["rmse"], rel=1e-3)
+    assert f"| plane | 0 | {rows[0]['ate_m']:.4f} |" in (tmp_path / "out" / "late_masks.md").read_text()
