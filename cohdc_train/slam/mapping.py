@@ -11,7 +11,7 @@ from cohdc_train.slam.window import close_window, open_window, solve
 
 _FUSE_KEYFRAMES = 8
 _TRIAL = 3  # keyframes after which a point must have proved itself
-_MIN_SEEN_BY = 2
+_MIN_SEEN_BY = 2  # keyframes, as ORB-SLAM2 has it where depth is measured
 _MIN_FOUND = 0.25
 
 
