@@ -1,13 +1,12 @@
 """tools/compose_people: a cut-out stands where geometry says, moves with the world, and hides behind what is nearer."""
 
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
+from tool_loader import load_tool
 
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.tum import Frame
@@ -20,13 +19,7 @@ LEVEL = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    loader = SourceFileLoader("compose_people", str(Path(__file__).parents[1] / "tools" / "compose_people"))
-    module = module_from_spec(spec_from_loader(loader.name, loader) or pytest.fail("no tools/compose_people"))
-    import sys
-
-    sys.modules[loader.name] = module  # dataclasses look their module up
-    loader.exec_module(module)
-    return module
+    return load_tool("compose_people")
 
 
 def standing(tool: ModuleType, distance: float, swing: float = 0.0) -> tuple[object, object]:

@@ -5,14 +5,12 @@ import os
 import subprocess
 import sys
 import venv
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
+from tool_loader import load_tool
 
 from cohdc_train.trajectory import Trajectory, write_tum
 
@@ -123,16 +121,9 @@ def test_wheel_tracks_and_scores_a_sequence(clean: Clean) -> None:
 # ---- Dockerfiles
 
 
-def check_docker() -> ModuleType:
-    loader = SourceFileLoader("check_docker", str(ROOT / "tools" / "check_docker"))
-    module = module_from_spec(spec_from_loader(loader.name, loader) or pytest.fail("no tools/check_docker"))
-    loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.stem)
 def test_dockerfile_copies_what_exists_and_pins(dockerfile: Path) -> None:
-    steps = check_docker().instructions(dockerfile)
+    steps = load_tool("check_docker").instructions(dockerfile)
     copied = [name for instruction, argument in steps if instruction == "COPY" for name in argument.split()[:-1]]
     assert copied
     assert [name for name in copied if not (ROOT / name).exists()] == []
@@ -143,7 +134,7 @@ def test_dockerfile_copies_what_exists_and_pins(dockerfile: Path) -> None:
 
 
 def test_checker_follows_a_dockerfile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tool = check_docker()
+    tool = load_tool("check_docker")
     monkeypatch.setattr(tool, "ROOT", tmp_path)
     monkeypatch.setattr(tool.venv, "create", lambda folder, with_pip: None)
     (tmp_path / "room").mkdir()

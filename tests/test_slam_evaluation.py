@@ -2,24 +2,19 @@
 
 import json
 import sys
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from slam_method import chosen_method
+from tool_loader import load_tool
 
 pytest.importorskip("embreex")
 
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    loader = SourceFileLoader("slam_evaluation", str(Path(__file__).parents[1] / "tools" / "slam_evaluation"))
-    module = module_from_spec(spec_from_loader(loader.name, loader) or pytest.fail("no tools/slam_evaluation"))
-    sys.modules[loader.name] = module  # dataclasses look their module up
-    loader.exec_module(module)
-    return module
+    return load_tool("slam_evaluation")
 
 
 @pytest.fixture(scope="module")

@@ -24,25 +24,52 @@ _NICE = 5  # the worker gives way to tracking when there are fewer cores than wo
 
 
 @dataclass(frozen=True)
-class _Job:
-    number: int  # of the frame, as Propagation counts
+class Job:
+    """A frame that may be segmented. number: as Propagation counts."""
+
+    number: int
     view: View
     half: Half
 
 
 @dataclass(frozen=True)
 class _Done:
-    job: _Job
+    job: Job
     mask: NDArray[np.bool_]  # half size
     growth: float  # px
     ms: float
 
 
-def widened(half: Mask, growth: float, age: float, view: View) -> Mask:
-    """[H, W] bool of a view, from a mask of half size that was carried to it for `age` s; growth: px, of a new one."""
-    height, width = view.rgb.shape[:2]
-    grown = grow(half, (growth + _WIDEN * age) / 2).astype(np.uint8)
-    return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+class CarriedMasks:
+    """The newest mask there is, carried to every frame; the older it is, the wider it is made.
+
+    newest: the frame that it was made of, None before the first.
+    """
+
+    def __init__(self) -> None:
+        self.newest: Job | None = None
+        self._growth = 0.0
+        self._propagation = Propagation()
+
+    def advance(self, view: View) -> Job:
+        """Go on to the next view."""
+        half = halve(view.rgb, view.depth)
+        return Job(self._propagation.advance(half), view, half)
+
+    def renew(self, job: Job, mask: Mask, growth: float) -> None:
+        """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is to grow."""
+        self.newest, self._growth = job, growth
+        self._propagation.renew(mask, job.number, job.half)
+
+    def mask(self, view: View) -> tuple[Mask, float]:
+        """[H, W] bool, True = dynamic, for the view that was gone on to, and the mask's age, s."""
+        mask, newest = self._propagation.mask(), self.newest
+        assert mask is not None
+        assert newest is not None
+        age = view.t - newest.view.t
+        height, width = view.rgb.shape[:2]
+        grown = grow(mask, (self._growth + _WIDEN * age) / 2).astype(np.uint8)
+        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0), age
 
 
 class AsyncMasks:
@@ -59,11 +86,10 @@ class AsyncMasks:
         self.ages: list[float] = []
         self.segment_ms: list[float] = []
         self._outline = outline
-        self._propagation = Propagation()
-        self._jobs: Slot[_Job] = Slot()
+        self._carried = CarriedMasks()
+        self._jobs: Slot[Job] = Slot()
         self._results: Slot[_Done] = Slot()
         self._busy = False
-        self._newest: _Done | None = None
         self._worker = threading.Thread(target=self._work, name="segmenter", daemon=True)
 
     def __enter__(self) -> "AsyncMasks":
@@ -79,27 +105,23 @@ class AsyncMasks:
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool, True = dynamic. Views must come in the order of time; raises what the segmenter raised."""
-        half = halve(view.rgb, view.depth)
-        job = _Job(self._propagation.advance(half), view, half)
+        job = self._carried.advance(view)
         self._take(self._results.poll())
         if not self._busy:
             self._jobs.put(job)
             self._busy = True
-        if self._newest is None:
+        if self._carried.newest is None:
             self._take(self._results.take())
-        mask, newest = self._propagation.mask(), self._newest
-        assert mask is not None
-        assert newest is not None
-        age = view.t - newest.job.view.t
+        mask, age = self._carried.mask(view)
         self.ages.append(age)
-        return widened(mask, newest.growth, age, view)
+        return mask
 
     def _take(self, done: _Done | None) -> None:
         if done is None:
             return
-        self._busy, self._newest = False, done
+        self._busy = False
         self.segment_ms.append(done.ms)
-        self._propagation.renew(done.mask, done.job.number, done.job.half)
+        self._carried.renew(done.job, done.mask, done.growth)
 
     def _work(self) -> None:
         if sys.platform == "linux":

@@ -5,14 +5,13 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.features import LEVELS
 from cohdc_train.slam.map import Keyframe, Map
-from cohdc_train.slam.mapping import drop_points
+from cohdc_train.slam.mapping import MIN_SEEN_BY, drop_points
 from cohdc_train.slam.window import WINDOW
 
 _AROUND = 64  # keyframes that are looked at, those that share most points with the newest
 _REDUNDANT = 0.9  # share of a keyframe's points that others must see as well
 _OTHERS = 3  # keyframes that see a point as well as this one
 _COARSER = 1  # pyramid level at which a point is still seen as well
-_FEWEST = 2  # keyframes that must see a point
 
 
 def cull_keyframes(world: Map, newest: Keyframe, keep: set[int]) -> list[Keyframe]:
@@ -53,4 +52,4 @@ def _remove(world: Map, keyframe: Keyframe) -> None:
     points = keyframe.seen_points()
     heir = next((k for k in world.covisible(points, 2) if k is not keyframe), world.keyframes[0])
     world.remove_keyframe(keyframe, heir)
-    drop_points(world, points[world.seen_by[points] < _FEWEST])
+    drop_points(world, points[world.seen_by[points] < MIN_SEEN_BY])

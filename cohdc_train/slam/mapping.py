@@ -11,7 +11,7 @@ from cohdc_train.slam.window import close_window, open_window, solve
 
 _FUSE_KEYFRAMES = 8
 _TRIAL = 3  # keyframes after which a point must have proved itself
-_MIN_SEEN_BY = 2  # keyframes, as ORB-SLAM2 has it where depth is measured
+MIN_SEEN_BY = 2  # keyframes that must see a point, as ORB-SLAM2 has it where depth is measured
 _MIN_FOUND = 0.25
 
 
@@ -73,7 +73,7 @@ def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
 def cull(world: Map, newest: int) -> None:
     """Drop young points that few keyframes confirmed or that frames rarely found where they should be."""
     young = np.flatnonzero((world.born[: world.size] >= newest - _TRIAL) & (world.seen_by[: world.size] > 0))
-    weak = (world.born[young] == newest - _TRIAL) & (world.seen_by[young] < _MIN_SEEN_BY)
+    weak = (world.born[young] == newest - _TRIAL) & (world.seen_by[young] < MIN_SEEN_BY)
     weak |= world.found[young] < _MIN_FOUND * world.visible[young]
     drop_points(world, young[weak])
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.camera import Camera
+from cohdc_train.slam.features import Features
 from cohdc_train.slam.optimization import exp_se3
 from cohdc_train.trajectory import Trajectory, write_tum
 
@@ -95,6 +96,12 @@ def render(
         sampled = cv2.remap(item.texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         rgb[seen], nearest[seen], moving[seen] = sampled[seen], depth[seen], item.moving
     return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
+
+
+def features_at(pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> Features:
+    """Corners of the finest level at pixels [n, 2] px, free of distortion, and depths [n] m, that look like nothing."""
+    none = np.zeros(len(pixels), dtype=np.int64)
+    return Features(pixels, pixels, none, np.zeros((len(pixels), 4), dtype=np.uint64), depths, none > 0)
 
 
 def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> Path:

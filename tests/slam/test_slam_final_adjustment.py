@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from plane_world import CAMERA, camera_path, render, room
+from plane_world import CAMERA, camera_path, features_at, render, room
 
 from cohdc_train.slam import final_adjustment
 from cohdc_train.slam.features import Features
@@ -26,9 +26,7 @@ def measured(T_wc: NDArray[np.float64], points: NDArray[np.float64], rng: np.ran
     local = to_local(inverse(T_wc), points)
     pixels = CAMERA.project(local) + rng.standard_normal((len(points), 2))
     depths = local[:, 2] * (1 + 0.02 * rng.standard_normal(len(points)))
-    nothing = np.zeros(len(points), dtype=np.int64)
-    words = np.zeros((len(points), 4), dtype=np.uint64)
-    return Features(pixels, pixels, nothing, words, depths, np.zeros(len(points), dtype=np.bool_))
+    return features_at(pixels, depths)
 
 
 def off_after_adjustment(seed: int, frames_count: bool) -> float:

@@ -1,11 +1,11 @@
 """Frames that optical flow tracks between two that are matched against the map."""
 
-from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from at_once import AtOnce
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
@@ -21,15 +21,6 @@ from cohdc_train.trajectory import Trajectory, score
 FRAMES = 31
 STILL = Expectation(Prior(np.eye(4), np.zeros((6, 6))), calm=False)
 View = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
-
-
-class AtOnce(Executor):
-    """An executor that does not run beside anything, so that its results do not depend on time."""
-
-    def submit(self, function: Any, /, *args: Any, **kwargs: Any) -> "Future[Any]":
-        job: Future[Any] = Future()
-        job.set_result(function(*args, **kwargs))
-        return job
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 import json
 import sys
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from plane_world import write_sequence
+from tool_loader import load_tool
 
 from cohdc_train.slam.run import slam
 from cohdc_train.slam.source import View
@@ -18,11 +17,7 @@ from cohdc_train.slam.source import View
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    loader = SourceFileLoader("late_masks", str(Path(__file__).parents[2] / "tools" / "late_masks"))
-    module = module_from_spec(spec_from_loader(loader.name, loader) or pytest.fail("no tools/late_masks"))
-    sys.modules[loader.name] = module  # dataclasses look their module up
-    loader.exec_module(module)
-    return module
+    return load_tool("late_masks")
 
 
 def square(frame: int) -> NDArray[np.bool_]:
@@ -55,3 +50,14 @@ def test_without_flow_and_in_time_it_is_the_synchronous_run(
     run = slam(sequence=sequence, out=tmp_path / "run", masks=sequence / "masks", features=400)
     assert rows[0]["ate_m"] == pytest.approx(run["ate_m"]["rmse"], rel=1e-3)
     assert f"| plane | 0 | {rows[0]['ate_m']:.4f} |" in (tmp_path / "out" / "late_masks.md").read_text()
+
+
+@pytest.mark.parametrize("gone", ["groundtruth.txt", "rgb.txt"])
+def test_a_sequence_that_cannot_be_used_is_one_line(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: str
+) -> None:
+    (write_sequence(tmp_path / "plane", 4) / gone).unlink()
+    monkeypatch.setattr(sys, "argv", ["late_masks", "--sequences", str(tmp_path / "plane"), "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match=gone) as stopped:
+        tool.main()
+    assert "\n" not in str(stopped.value)

@@ -1,9 +1,8 @@
 """Which young points stay in the map."""
 
 import numpy as np
-from plane_world import CAMERA
+from plane_world import CAMERA, features_at
 
-from cohdc_train.slam.features import Features
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.mapping import cull
 
@@ -12,9 +11,8 @@ ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them
 
 def keyframe(index: int, point_ids: list[int]) -> Keyframe:
     """One that looks at a wall 2 m away, a corner for each of four points; -1 where it does not see one."""
-    pixels, none = np.array([[100.0, 80.0], [200.0, 80.0], [100.0, 160.0], [200.0, 160.0]]), np.zeros(4, dtype=np.int64)
-    depths, precise = np.full(4, 2.0), np.zeros(4, dtype=np.bool_)
-    features = Features(pixels, pixels, none, np.zeros((4, 4), dtype=np.uint64), depths, precise)
+    pixels = np.array([[100.0, 80.0], [200.0, 80.0], [100.0, 160.0], [200.0, 160.0]])
+    features = features_at(pixels, np.full(4, 2.0))
     picture = np.zeros((2, 2), dtype=np.float32)
     return Keyframe(index, index / 3, np.eye(4), features, np.array(point_ids), picture, picture)
 

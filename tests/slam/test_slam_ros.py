@@ -6,8 +6,6 @@ import sys
 import threading
 from array import array
 from collections.abc import Callable
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
@@ -17,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 from scipy.spatial.transform import Rotation
+from tool_loader import load_tool
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.camera import Camera
@@ -209,11 +208,8 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         module = ModuleType(name)
         module.__dict__.update(members)
         monkeypatch.setitem(sys.modules, name, module)
-    loader = SourceFileLoader("ros2_node", str(Path(__file__).parents[2] / "tools" / "ros2_node"))
-    tool = module_from_spec(spec_from_loader(loader.name, loader) or pytest.fail("no tools/ros2_node"))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    loader.exec_module(tool)
-    return tool
+    return load_tool("ros2_node")
 
 
 def test_the_node_publishes_and_writes(ros: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

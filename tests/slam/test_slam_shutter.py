@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from plane_world import CAMERA
+from plane_world import CAMERA, features_at
 
 from cohdc_train.slam.features import Features
 from cohdc_train.slam.optimization import Array, exp_se3, to_local
@@ -24,8 +24,7 @@ def seen(points: Array, twist: Array) -> Features:
         )
         pixels = CAMERA.project(local)
         late = ROLLING.readout * (pixels[:, 1] / CAMERA.height - 0.5)
-    none = np.zeros(len(points), dtype=np.int64)
-    return Features(pixels, pixels, none, np.zeros((len(points), 4), dtype=np.uint64), local[:, 2], none > 0)
+    return features_at(pixels, local[:, 2])
 
 
 @given(speeds)
