@@ -20,7 +20,7 @@ from cohdc_train.slam.source import View
 Outline = Callable[[View], tuple[Mask, float]]
 
 _WIDEN = 30.0  # px per second of a mask's age
-_NICE = 5  # the worker gives way to tracking when there are fewer cores than work
+_NICE = 15  # the worker gives way to tracking when there are fewer cores than work
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.optimization import Array, Weighing
 from cohdc_train.slam.window import Solution, Window, close_window, open_window, solve
 
-_NICE = 5  # the worker gives way to tracking when there are fewer cores than work
+_NICE = 15  # the worker gives way to tracking when there are fewer cores than work
 
 
 class BackgroundMapper:

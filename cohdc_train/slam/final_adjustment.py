@@ -13,6 +13,7 @@ from cohdc_train.slam.features import Features
 from cohdc_train.slam.frame_log import FrameLog
 from cohdc_train.slam.localization import Fit
 from cohdc_train.slam.map import Map, observations
+from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.motion import FEW
 from cohdc_train.slam.optimization import Array, Observations, Weighing
 from cohdc_train.slam.window import Sighting, adjust_everything
@@ -39,19 +40,22 @@ class SeenFrames:
         self._every = 1
         self._count = 0
 
-    def append(self, row: int, fit: Fit, features: Features, world: Map) -> None:
-        """The settled frame in a row of the log, after those before it, and its corners.
+    def chosen(self, fit: Fit) -> Matches | None:
+        """What is wanted of the next settled frame, if anything.
 
         One that saw little is not kept: what it gives would not do for a pose.
         """
         if len(fit.matches) < _TURNS * FEW:
-            return
+            return None
         number, self._count = self._count, self._count + 1
         if number % self._every:
-            return
+            return None
         turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
-        some = fit.matches.take((fit.matches.points + turn) % _TURNS == 0)
-        ids, seen = some.points, observations(features, some.corners)
+        return fit.matches.take((fit.matches.points + turn) % _TURNS == 0)
+
+    def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
+        """What was chosen of the frame in a row of the log, after those before it, and its corners."""
+        ids, seen = matches.points, observations(features, matches.corners)
         self._kept.append(_Kept(row, ids, world.born[ids], seen))
         if len(self._kept) > _MOST:
             self._kept = self._kept[::2]
@@ -75,5 +79,8 @@ class SeenFrames:
 
 def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
     """What a frame saw of points that are still there."""
-    there = np.flatnonzero((world.born[kept.ids] == kept.born) & (world.seen_by[kept.ids] > 0))
-    return Sighting(T_cw, kept.ids[there], kept.seen.take(there))
+    same = np.flatnonzero(world.born[kept.ids] == kept.born)
+    ids = world.current(kept.ids[same])
+    there = np.flatnonzero(world.seen_by[ids] > 0)
+    ids, first = np.unique(ids[there], return_index=True)
+    return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))

@@ -20,6 +20,7 @@ from cohdc_train.slam.motion import Expectation
 from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
 
 _BETWEEN = 2  # frames in a row: ten times a second the map is consulted
+_AT_MOST = 5  # while there is no time for it
 _WINDOW = (13, 13)  # px of a patch
 _LEVELS = 2  # of the image pyramid above the image itself
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
@@ -58,7 +59,7 @@ class FlowTracker:
         self.map = world
         self._weighing = weighing
         self._start: _Start | None = None
-        self._left = 0
+        self._followed = 0
 
     def begin(
         self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None, mask: NDArray[np.bool_] | None
@@ -68,7 +69,7 @@ class FlowTracker:
         fit: None when the place is lost; mask: [H, W] bool, as it was given. What has been matched under it all the
         same, because it is at rest, may be followed there.
         """
-        self._start, self._left = None, _BETWEEN
+        self._start, self._followed = None, 0
         if fit is None or len(fit.matches) < _LEAST:
             return
         rows = fit.matches.corners
@@ -77,13 +78,13 @@ class FlowTracker:
         self._start = _Start(gray_of(rgb), corners, fit, off, _covered(corners.pixels, mask))
 
     def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
-        """Look for the points in the next frame; None when it is to be matched.
+        """Look for the points in the next frame; None when there is nothing to look for.
 
         rgb: [H, W, 3]; mask: [H, W] bool, True = dynamic: nothing is followed to there; T_cw: [4, 4] expected pose.
         """
-        if self._start is None or self._left == 0:
+        self._followed += 1
+        if self._start is None:
             return None
-        self._left -= 1
         before = self._start
         guess = (self._seen_from(T_cw, before.fit.matches.points) + before.off).astype(np.float32)
         starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -93,8 +94,15 @@ class FlowTracker:
         pixels = np.asarray(found, dtype=np.float64)
         rows = np.flatnonzero((status[:, 0] > 0) & _inside(pixels, self.map.camera))
         rows = rows[before.masked[rows] | ~_covered(pixels[rows], mask)]
-        corners = replace(before.corners.take(rows), pixels=pixels[rows])
-        return Followed(before.fit.matches.points[rows], corners)
+        known = before.fit.matches.points[rows]
+        ids, first = np.unique(self.map.current(known), return_index=True)
+        rows, same = rows[first], ids == known[first]
+        corners = before.corners.take(rows)
+        return Followed(ids, replace(corners, pixels=pixels[rows], precise=corners.precise & same))
+
+    def over(self, hurry: bool) -> bool:
+        """Whether the frame that was followed to is to be matched, and be begun from. hurry: the next one waits."""
+        return self._followed > (_AT_MOST if hurry else _BETWEEN)
 
     def locate(self, followed: Followed, features: Features, expected: Expectation) -> Fit | None:
         """The pose on which enough of the points agree. features: of the followed corners."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cohdc_train.slam.localization import Fit
-from cohdc_train.slam.map import Keyframe, Map
+from cohdc_train.slam.map import Map
 from cohdc_train.slam.optimization import Array, inverse
 from cohdc_train.slam.smoothing import smoothed
 
@@ -28,10 +28,12 @@ class FrameLog:
     def __init__(self) -> None:
         self._frames: list[_Logged] = []
 
-    def append(self, t: float, fit: Fit, reference: Keyframe) -> int:
+    def append(self, t: float, fit: Fit, world: Map) -> int:
         """The frame at t, s, after those before it. Returns its row."""
-        relative = fit.T_cw @ inverse(reference.T_cw)
-        self._frames.append(_Logged(t, reference.index, relative, fit.information, fit.pull))
+        assert fit.reference is not None
+        index = fit.reference.index
+        relative = fit.T_cw @ inverse(world.pose(index))
+        self._frames.append(_Logged(t, index, relative, fit.information, fit.pull))
         return len(self._frames) - 1
 
     @property

@@ -53,14 +53,21 @@ class Localizer:
         self._judges = judges
         self._rng = np.random.default_rng(seed)
 
-    def near(self, features: Features, rgb: NDArray[np.uint8], last: Fit, expected: Expectation) -> Fit | None:
+    def near(
+        self,
+        features: Features,
+        rgb: NDArray[np.uint8],
+        last: Fit,
+        expected: Expectation,
+        flown: Fit | None = None,
+    ) -> Fit | None:
         """The frame after `last`. Where it sees little, what was expected counts as well.
 
-        A camera that moves calmly is where it is expected, to a few px: the map is asked at once. Where it does not
-        answer, a rough pose comes first.
+        flown: where flow says it is. There, or where a camera that moves calmly is expected, it is to a few px: the map
+        is asked at once. Where it does not answer, a rough pose comes first.
         """
-        if expected.calm:
-            there = Fit(expected.prior.T_cw, last.matches)
+        if expected.calm or flown is not None:
+            there = Fit(expected.prior.T_cw, last.matches) if flown is None else flown
             enough = max(_MIN_TRACKED, round(_AS_BEFORE * len(last.matches)))
             fit = self._against_local_map(features, there, enough, expected)
             if fit is not None:

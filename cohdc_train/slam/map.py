@@ -71,6 +71,7 @@ class Map:
         self.seen_by = np.zeros(1024, dtype=np.int64)  # keyframes
         self.observers = np.zeros((1024, _OBSERVERS), dtype=np.int32)  # keyframe index + 1, 0 = none, in any order
         self.born = np.zeros(1024, dtype=np.int64)  # keyframe index
+        self.became = np.full(1024, -1)  # the point that took over the one in this row
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
         self.found = np.zeros(1024, dtype=np.int64)  # frames that did
         self.moved = np.zeros(1024)  # log-odds against standing still, beyond those of a new point
@@ -119,6 +120,7 @@ class Map:
         self.descriptors[ids] = features.descriptors[corners]
         self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[corners]
         self.born[ids] = keyframe.index
+        self.became[ids] = -1
         self.directions[ids] = 0.0
         self.moved[ids] = 0.0
         self.visible[ids] = self.found[ids] = 1
@@ -144,6 +146,7 @@ class Map:
         would count what a group did twice.
         """
         np.maximum.at(self.moved, new, self.moved[old])
+        self.became[old] = new
         alias = np.arange(self.size + 1)
         alias[old] = new
         alias[-1] = -1
@@ -158,6 +161,15 @@ class Map:
             moved, first = np.unique(ids[changed], return_index=True)
             fresh = ~taken[moved]
             self.observe(keyframe, Matches(moved[fresh], changed[first[fresh]]))
+
+    def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[n] what the points `ids` have become, by however many steps: themselves where none took them over."""
+        while True:
+            heirs = self.became[ids]
+            taken = (heirs >= 0) & (self.born[heirs] <= self.born[ids])  # else a new point has the heir's row
+            if not taken.any():
+                return ids
+            ids = np.where(taken, heirs, ids)
 
     def trust(self, ids: NDArray[np.int64]) -> Array:
         """[n] probability that each point stands still, as a share of a new point's: its weight, above 0 up to 1."""
@@ -248,7 +260,7 @@ class Map:
         return ids
 
     def _reserve(self, count: int) -> None:
-        counters = ("seen_by", "observers", "born", "visible", "found", "moved")
+        counters = ("seen_by", "observers", "born", "became", "visible", "found", "moved")
         names = ("positions", "descriptors", "directions", "reach", *counters)
         while len(self.positions) < count:
             for name in names:

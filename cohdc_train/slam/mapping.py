@@ -1,9 +1,8 @@
-"""What happens when a keyframe joins: new points, duplicates merged, local bundle adjustment, weak points out."""
+"""What a keyframe that joins brings: new points, duplicates merged, local bundle adjustment, weak points out."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.background_mapping import BackgroundMapper
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import match_projected
 from cohdc_train.slam.optimization import Weighing
@@ -13,20 +12,6 @@ _FUSE_KEYFRAMES = 8
 _TRIAL = 3  # keyframes after which a point must have proved itself
 MIN_SEEN_BY = 2  # keyframes that must see a point, as ORB-SLAM2 has it where depth is measured
 _MIN_FOUND = 0.25
-
-
-def insert_keyframe(world: Map, keyframe: Keyframe, weighing: Weighing, mapper: BackgroundMapper | None = None) -> None:
-    """Take a tracked keyframe into the map and put its neighbourhood in order; with a mapper, the sums come later."""
-    world.add_keyframe(keyframe)
-    add_points(world, keyframe)
-    if len(world.keyframes) == 1:
-        return
-    fuse(world, keyframe)
-    if mapper is None:
-        adjust_window(world, keyframe, weighing)
-    else:
-        mapper.start(world, keyframe)
-    cull(world, keyframe.index)
 
 
 def add_points(world: Map, keyframe: Keyframe) -> None:

@@ -44,7 +44,7 @@ class Paced:
     knows how many will come, at once.
 
     `dropped` counts the views that a newer one replaced before they were asked for. `latencies`, s: from when a view
-    was due until it had been dealt with and the next was asked for, without the first. `behind`, s: what playing took
+    was due until `answered`, or else until the next was asked for, without the first. `behind`, s: what playing took
     longer than the recording, because images could not be read as fast; then all later ones are due so much later.
     """
 
@@ -59,11 +59,22 @@ class Paced:
         self._slot: Slot[tuple[View, float]] = Slot()
         self._stop = threading.Event()
         self._reader: threading.Thread | None = None
+        self._due: float | None = None  # of the view that was given out last, until it is answered
 
     @property
     def dropped(self) -> int:
         """Views that were not given out."""
         return self._slot.dropped
+
+    def waits(self) -> bool:
+        """Whether the next view is there already."""
+        return self._slot.full
+
+    def answered(self) -> None:
+        """What was wanted of the latest view is known."""
+        if self._due is not None:
+            self.latencies.append(self._clock.now() - self._due)
+            self._due = None
 
     def __len__(self) -> int:
         return len(self._source)
@@ -88,9 +99,9 @@ class Paced:
         self._reader = threading.Thread(target=self._read, args=(views, start), name="reader", daemon=True)
         self._reader.start()
         while (item := self._slot.take()) is not None:
-            view, due = item
+            view, self._due = item
             yield view
-            self.latencies.append(self._clock.now() - due)
+            self.answered()
 
     def _read(self, views: Iterator[View], start: float) -> None:
         try:

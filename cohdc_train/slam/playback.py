@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.slam.culling import MaskSource
 from cohdc_train.slam.features import FeatureExtractor, Features
+from cohdc_train.slam.pose import OnPose
 from cohdc_train.slam.results import FrameRecord, draw_after, draw_before, write_jpeg
 from cohdc_train.slam.source import Source, View
 from cohdc_train.slam.tracking import Tracker
@@ -30,9 +31,15 @@ class _Picture:
 
 
 def play(
-    tracker: Tracker, source: Source, mask_of: MaskSource, pictures: Path, watchers: Sequence[Watcher]
+    tracker: Tracker,
+    source: Source,
+    mask_of: MaskSource,
+    pictures: Path,
+    watchers: Sequence[Watcher],
+    on_pose: OnPose | None = None,
 ) -> list[FrameRecord]:
-    """Track every view and call the watchers after it; then draw some into the new folder `pictures`.
+    """Track every view, call on_pose as soon as its pose is known, and the watchers when all is done with it; then draw
+    some into the new folder `pictures`.
 
     Raises DataError for a view that cannot be used, unless the source is live and has given some, and when none comes.
     """
@@ -42,7 +49,7 @@ def play(
     drawn: list[_Picture] = []
     try:
         for index, view in enumerate(source):
-            mask, record = _step(tracker, view, mask_of)
+            mask, record = _step(tracker, view, mask_of, on_pose)
             records.append(record)
             if index in chosen and tracker.features is not None:
                 drawn.append(_Picture(view, tracker.mask, tracker.features))
@@ -72,12 +79,14 @@ def _pictured(count: int) -> set[int]:
     return set(np.linspace(0, count - 1, min(_PICTURES, count)).round().astype(int).tolist())
 
 
-def _step(tracker: Tracker, view: View, mask_of: MaskSource) -> tuple[NDArray[np.bool_] | None, FrameRecord]:
+def _step(
+    tracker: Tracker, view: View, mask_of: MaskSource, on_pose: OnPose | None
+) -> tuple[NDArray[np.bool_] | None, FrameRecord]:
     """One frame: what a watcher gets as its mask, and what became of it."""
     start = time.perf_counter()
     mask = mask_of(view)
     segment_ms = 0.0 if mask is None else 1e3 * (time.perf_counter() - start)
-    pose = tracker.track(view.rgb, view.depth, view.t, mask, view.depth_t)
+    pose = tracker.track(view.rgb, view.depth, view.t, mask, view.depth_t, on_pose)
     culled = 0.0 if tracker.mask is None else float(tracker.mask.mean())
     # Who is at rest is of use to tracking, but belongs into no cloud.
     mask = tracker.mask if mask is None or tracker.mask is None else mask | tracker.mask

@@ -12,6 +12,7 @@ from cohdc_train.slam.async_masks import AsyncMasks
 from cohdc_train.slam.background_mapping import worker_process
 from cohdc_train.slam.culling import FolderMasks, MaskSource, ModelMasks, no_masks
 from cohdc_train.slam.paced import Paced
+from cohdc_train.slam.pose import OnPose, Pose
 from cohdc_train.slam.results import quantiles
 from cohdc_train.slam.source import Source
 
@@ -29,8 +30,18 @@ class Workers:
         """Every frame's mask."""
         return self.masks or no_masks
 
+    def answering(self, on_pose: OnPose | None) -> OnPose:
+        """The same, after the source has learnt that there is an answer."""
+
+        def answered(pose: Pose) -> None:
+            self.source.answered()
+            if on_pose is not None:
+                on_pose(pose)
+
+        return answered
+
     def metrics(self) -> dict[str, Any]:
-        """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until it had been dealt with), of
+        """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until its pose was known), of
         the masks' `age`, and of the `segmenter`, for which nobody waited; how many frames were `dropped`; by how many
         seconds playing fell `behind` the recording."""
         result: dict[str, Any] = {

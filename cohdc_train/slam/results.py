@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.features import Features
-from cohdc_train.slam.tracking import Pose
+from cohdc_train.slam.pose import Pose
 from cohdc_train.trajectory import Trajectory, score, write_tum
 
 _NOT_ALWAYS = ("cloud.ply", "map.png")  # files of a run that not every run writes

@@ -17,6 +17,7 @@ from cohdc_train.slam.live import Followed, stopped_by_ctrl_c
 from cohdc_train.slam.map_files import MapFiles
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.playback import play
+from cohdc_train.slam.pose import OnPose
 from cohdc_train.slam.realtime import workers
 from cohdc_train.slam.results import check_out, measure, publish, write_run
 from cohdc_train.slam.source import Recorded, Source, rgbd_layout
@@ -106,12 +107,14 @@ def run_source(
     view: bool = False,
     rrd: Path | None = None,
     watchers: Sequence[Watcher] = (),
+    on_pose: OnPose | None = None,
     origin: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """`slam` of any source of views, a camera of one's own for instance; the same files, metrics and errors.
 
-    watchers: called after every frame; origin: words about the source for config.yaml. Raises DataError when no frame
-    comes.
+    on_pose: called with every frame's pose as soon as it is known; watchers: when what the frame adds to the map has
+    been done as well, in real time up to a frame's time later; origin: words about the source for config.yaml. Raises
+    DataError when no frame comes.
     """
     _check_options(out, model, masks, seed, features)
     features = (_FEATURES_REALTIME if realtime else _FEATURES) if features is None else features
@@ -126,14 +129,17 @@ def run_source(
         part = Path(folder)
         with ExitStack() as stack:
             beside = stack.enter_context(workers(source, maker)) if realtime else None
-            tracker = Tracker(source.camera, features, seed, method, beside.executor if beside else None)
+            tracker = Tracker(source.camera, features, seed, method)
+            if beside is not None:
+                tracker = Tracker(source.camera, features, seed, method, beside.executor, beside.source.waits)
+                on_pose = beside.answering(on_pose)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
             watchers = [files, *watchers]
             if view or rrd is not None:
                 watchers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
             stack.enter_context(stopped_by_ctrl_c(source))
             views, mask_of = (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
-            records = play(tracker, views, mask_of, part / "pictures", watchers)
+            records = play(tracker, views, mask_of, part / "pictures", watchers, on_pose)
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops, "without_depth": source.without_depth}

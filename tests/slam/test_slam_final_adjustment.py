@@ -71,7 +71,9 @@ def remember(seen: SeenFrames, row: int, tracker: Tracker) -> None:
     """The tracker's latest frame, as one in that row of the log."""
     assert tracker._last is not None
     assert tracker.features is not None
-    seen.append(row, tracker._last, tracker.features, tracker.map)
+    chosen = seen.chosen(tracker._last)
+    if chosen is not None:
+        seen.append(row, chosen, tracker.features, tracker.map)
 
 
 def test_memory_is_bounded_and_what_is_kept_lies_evenly(tracker: Tracker, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,11 +132,9 @@ def test_frames_give_all_their_points_between_them(
 def test_a_frame_that_saw_little_is_not_kept(tracker: Tracker) -> None:
     fit, seen = tracker._last, SeenFrames()
     assert fit is not None
-    assert tracker.features is not None
-    for points in (2 * FEW - 1, 2 * FEW):
+    for points, wanted in ((2 * FEW - 1, False), (2 * FEW, True)):
         few = replace(fit, matches=fit.matches.take(np.arange(points)))
-        seen.append(0, few, tracker.features, tracker.map)
-    assert len(seen._kept) == 1
+        assert (seen.chosen(few) is not None) == wanted
 
 
 def test_a_row_that_a_younger_point_has_taken_says_nothing(tracker: Tracker) -> None:

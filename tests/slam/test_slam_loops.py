@@ -11,7 +11,8 @@ from cohdc_train.slam.alignment import Picture, take_picture
 from cohdc_train.slam.map import Keyframe, Map, observations
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import Weighing, chi_square, exp_se3, inverse
-from cohdc_train.slam.tracking import Pose, Tracker
+from cohdc_train.slam.pose import Pose
+from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.verification import Loop, Verifier
 from cohdc_train.slam.window import adjust_everything
 from cohdc_train.trajectory import Trajectory, score

@@ -8,7 +8,8 @@ from plane_world import CAMERA, camera_path, render, room
 from cohdc_train.slam.features import Corners, Features
 from cohdc_train.slam.matching import Matches, Projected, match_projected, one_to_one
 from cohdc_train.slam.optimization import exp_se3, inverse
-from cohdc_train.slam.tracking import Pose, Tracker
+from cohdc_train.slam.pose import Pose
+from cohdc_train.slam.tracking import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 BLACK = np.zeros((240, 320, 3), dtype=np.uint8)
