@@ -20,12 +20,13 @@ from cohdc_train.slam.motion import Expectation
 from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
 
 _BETWEEN = 2  # frames in a row: ten times a second the map is consulted
-_AT_MOST = 5  # while there is no time for it
+_AT_MOST = 5  # while there is no time for more
 _WINDOW = (13, 13)  # px of a patch
 _LEVELS = 2  # of the image pyramid above the image itself
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _LEAST = 50  # points that agree on a pose
-_SHARE = 0.6  # of the points that set out: where fewer agree, much has changed
+_SHARE = 0.4  # of the points that set out, that agree on a pose
+_MUCH_HAS_CHANGED = 0.6  # of them: where fewer agree, the frame is to be matched
 _NEAR = 0.05  # m
 
 
@@ -60,6 +61,7 @@ class FlowTracker:
         self._weighing = weighing
         self._start: _Start | None = None
         self._followed = 0
+        self._agree = 0  # points
 
     def begin(
         self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None, mask: NDArray[np.bool_] | None
@@ -100,10 +102,6 @@ class FlowTracker:
         corners = before.corners.take(rows)
         return Followed(ids, replace(corners, pixels=pixels[rows], precise=corners.precise & same))
 
-    def over(self, hurry: bool) -> bool:
-        """Whether the frame that was followed to is to be matched, and be begun from. hurry: the next one waits."""
-        return self._followed > (_AT_MOST if hurry else _BETWEEN)
-
     def locate(self, followed: Followed, features: Features, expected: Expectation) -> Fit | None:
         """The pose on which enough of the points agree. features: of the followed corners."""
         assert self._start is not None
@@ -114,10 +112,18 @@ class FlowTracker:
         points, seen = self.map.measured(matches, features)
         prior = expected.given(len(features))
         T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._weighing, prior=prior)
-        if inlier.sum() < least:
+        self._agree = int(inlier.sum())
+        if self._agree < least:
             return None
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
         return Fit(T_cw, matches.take(inlier), self._start.fit.reference, prior, information)
+
+    def over(self, hurry: bool) -> bool:
+        """Whether the frame that was followed to is to be matched, and be begun from. hurry: the next one waits."""
+        if hurry:
+            return self._followed > _AT_MOST
+        assert self._start is not None
+        return self._followed > _BETWEEN or self._agree < _MUCH_HAS_CHANGED * len(self._start.fit.matches)
 
     def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
         """[m, 2] px as the lens shows them, of points of the map."""

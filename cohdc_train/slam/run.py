@@ -27,7 +27,7 @@ from cohdc_train.slam.viewer import Viewer
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory, read_tum
 
-_FEATURES, _FEATURES_REALTIME = 1500, 1000  # corners per frame
+_FEATURES, _FEATURES_REALTIME = 1500, 1250  # corners per frame
 
 
 def slam(
@@ -62,7 +62,7 @@ def slam(
         masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
         camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
         seed: of the random samples; the same seed gives the same numbers.
-        features: corners per frame; 1500, or 1000 in real time, when not given.
+        features: corners per frame; 1500, or 1250 in real time, when not given.
         culling: how masks are made.
         method: which parts of the method run.
         realtime: frames come at the pace of their stamps, one that is late is dropped and counted; masks and mapping
