@@ -119,7 +119,7 @@ class FlowTracker:
         return Fit(T_cw, matches.take(inlier), self._start.fit.reference, prior, information)
 
     def over(self, hurry: bool) -> bool:
-        """Whether the frame that was followed to is to be matched, and be begun from. hurry: the next one waits."""
+        """Whether the frame that was followed to is to be matched, and be begun from. hurry: it may wait."""
         if hurry:
             return self._followed > _AT_MOST
         assert self._start is not None

@@ -59,22 +59,24 @@ class Paced:
         self._slot: Slot[tuple[View, float]] = Slot()
         self._stop = threading.Event()
         self._reader: threading.Thread | None = None
-        self._due: float | None = None  # of the view that was given out last, until it is answered
+        self._due: float | None = None  # of the view that was given out last
+        self._answered = True
+        self._between = float("inf")  # s, from one view to the next
 
     @property
     def dropped(self) -> int:
         """Views that were not given out."""
         return self._slot.dropped
 
-    def waits(self) -> bool:
-        """Whether the next view is there already."""
-        return self._slot.full
+    def late(self) -> bool:
+        """Whether half of the time has gone that lies between views, so that work would hold up the next."""
+        return self._due is not None and self._clock.now() > self._due + self._between / 2
 
     def answered(self) -> None:
         """What was wanted of the latest view is known."""
-        if self._due is not None:
+        if self._due is not None and not self._answered:
             self.latencies.append(self._clock.now() - self._due)
-            self._due = None
+            self._answered = True
 
     def __len__(self) -> int:
         return len(self._source)
@@ -100,10 +102,12 @@ class Paced:
         self._reader.start()
         while (item := self._slot.take()) is not None:
             view, self._due = item
+            self._answered = False
             yield view
             self.answered()
 
     def _read(self, views: Iterator[View], start: float) -> None:
+        before = float("-inf")
         try:
             for view in views:
                 due = self._clock.now()
@@ -114,6 +118,7 @@ class Paced:
                 if self._stop.is_set():
                     return
                 self._slot.put((view, due))
+                self._between, before = due - before, due
         except Exception as error:
             self._slot.close(error)
         else:

@@ -131,7 +131,7 @@ def run_source(
             beside = stack.enter_context(workers(source, maker)) if realtime else None
             tracker = Tracker(source.camera, features, seed, method)
             if beside is not None:
-                tracker = Tracker(source.camera, features, seed, method, beside.executor, beside.source.waits)
+                tracker = Tracker(source.camera, features, seed, method, beside.executor, beside.source.late)
                 on_pose = beside.answering(on_pose)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
             watchers = [files, *watchers]

@@ -16,11 +16,6 @@ class Slot(Generic[T]):
         self._error: Exception | None = None
         self.dropped = 0
 
-    @property
-    def full(self) -> bool:
-        """Whether an item waits to be taken."""
-        return self._item is not None
-
     def put(self, item: T) -> None:
         """Replace what is there."""
         with self._changed:

@@ -51,7 +51,7 @@ class Tracker:
     """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit.
 
     With an executor bundle adjustment runs there, beside tracking (`background_mapping`); poses then depend on time.
-    hurry: asked when a frame's pose is known, whether the next frame waits; what can be put off then is.
+    hurry: asked when a frame's pose is known, whether work would hold up the next frame; what can be put off then is.
     """
 
     def __init__(

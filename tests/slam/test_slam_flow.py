@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.features import Corners
-from cohdc_train.slam.flow_tracking import FlowTracker
+from cohdc_train.slam.flow_tracking import Followed, FlowTracker
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.motion import Expectation
@@ -35,7 +35,8 @@ class Watched:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, flow: bool = True) -> None:
         method = Method(flow=flow, global_adjustment=False, smoothing=False)
-        self.tracker = Tracker(CAMERA, 500, method=method, executor=AtOnce())
+        self.hurry = False
+        self.tracker = Tracker(CAMERA, 500, method=method, executor=AtOnce(), hurry=lambda: self.hurry)
         self.searched: list[int] = []
         self.poses: list[Pose] = []
         find = self.tracker._extract.find
@@ -73,6 +74,81 @@ def test_two_of_three_frames_need_no_corners_and_are_as_exact(
     assert sum(pose.keyframe for pose in flow.poses) <= sum(pose.keyframe for pose in matched.poses)
     assert flow.ate() < 0.004
     assert flow.ate() < 1.25 * matched.ate()
+
+
+def test_the_answer_by_flow_comes_before_the_frame_is_matched(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Watched(monkeypatch)
+    tracker, told = run.tracker, list[Pose]()
+    for index, view in enumerate(views[:13]):
+        searched = len(run.searched)
+
+        def tell(pose: Pose, index: int = index, searched: int = searched) -> None:
+            told.append(pose)
+            assert index == 0 or len(run.searched) == searched, "nothing has been searched yet"
+
+        final = tracker.track(view[0], view[1], index / 30, on_pose=tell)
+        assert len(told) == index + 1
+        assert told[-1].T_wc is not None
+        assert final.T_wc is not None
+        np.testing.assert_allclose(told[-1].T_wc, final.T_wc, atol=0.003)
+        assert told[-1].track_ms == final.track_ms
+    assert len(run.searched) == 5
+
+
+def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Watched(monkeypatch)
+    work, worked = run.tracker._mapping.work, list[int]()
+
+    def noted() -> None:
+        worked.append(len(run.poses))
+        work()
+
+    monkeypatch.setattr(run.tracker._mapping, "work", noted)
+    run.track(views[0])
+    run.hurry = True
+    for view in views[1:14]:
+        assert run.track(view).tracked
+    assert run.searched == [0, 6, 12]
+    assert min(worked, default=99) >= 6, "a keyframe that follows lets what is left of the one before be done"
+    run.hurry = False
+    for view in views[14:20]:
+        run.track(view)
+    assert run.searched == [0, 6, 12, 15, 18]
+    assert {14, 16, 17} <= set(worked)
+
+
+def test_a_keyframes_upkeep_is_done_in_parts_while_flow_tracks(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Watched(monkeypatch)
+    left, keyframes = [], []
+    for view in views:
+        keyframes.append(run.track(view).keyframe)
+        left.append(len(run.tracker._mapping._parts))
+    newest = [index for index in np.flatnonzero(keyframes).tolist() if index < len(views) - 2]
+    assert len(newest) >= 2
+    for index in newest:
+        assert left[index : index + 3] == [2, 1, 0]
+    run.tracker.finish()
+    assert not run.tracker._mapping._parts
+
+
+def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become(views: list[View]) -> None:
+    flow, tracker = begun(views[0])
+    first = flow.follow(views[0][0], None, np.eye(4))
+    assert first is not None
+    precise = first.ids[first.corners.precise]
+    old, new = precise[:1], precise[1:2]
+    tracker.map.became[old] = new
+    again = flow.follow(views[0][0], None, np.eye(4))
+    assert again is not None
+    assert old not in again.ids
+    assert np.count_nonzero(again.ids == new) == 1, "no point is followed twice"
+    tracker.map.became[old] = -1
 
 
 def test_the_same_frames_give_the_same_bits(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,6 +233,22 @@ def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
     shifted = features.points.copy()
     shifted[: len(shifted) // 2, 0] += 30
     assert flow.locate(followed, replace(features, points=shifted), STILL) is None
+
+
+@pytest.mark.parametrize(("found", "answers", "over"), [(0.7, True, False), (0.5, True, True), (0.3, False, True)])
+def test_a_frame_in_which_flow_loses_many_points_is_matched_after_the_answer(
+    views: list[View], found: float, answers: bool, over: bool
+) -> None:
+    flow, tracker = begun(views[0])
+    followed = flow.follow(views[0][0], None, np.eye(4))
+    assert followed is not None
+    some = np.arange(round(found * len(followed.ids)))
+    left = Followed(followed.ids[some], followed.corners.take(some))
+    fit = flow.locate(left, tracker._extract.measure(left.corners, views[0][1]), STILL)
+    assert (fit is not None) == answers
+    if fit is not None:
+        np.testing.assert_allclose(fit.T_cw, np.eye(4), atol=1e-4)
+        assert (flow.over(hurry=False), flow.over(hurry=True)) == (over, False)
 
 
 def test_no_flow_sets_out_from_a_frame_without_a_pose(views: list[View]) -> None:

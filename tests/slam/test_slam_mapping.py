@@ -17,6 +17,26 @@ def keyframe(index: int, point_ids: list[int]) -> Keyframe:
     return Keyframe(index, index / 3, np.eye(4), features, np.array(point_ids), picture, picture)
 
 
+def test_what_a_point_has_become() -> None:
+    """The last of three is taken over by the second, and that by the first; later a new point has the first's row."""
+    world = Map(CAMERA)
+    frames = [keyframe(index, [-1, -1, -1, -1]) for index in range(4)]
+    for index in range(3):
+        world.add_keyframe(frames[index])
+        world.add_points(frames[index], np.array([0]))
+    everything, ids = np.arange(3), [np.array([index]) for index in range(3)]
+    np.testing.assert_array_equal(world.current(everything), everything)
+    world.replace(ids[2], ids[1], frames)
+    world.replace(ids[1], ids[0], frames)
+    np.testing.assert_array_equal(world.current(everything), [0, 0, 0])
+    for frame in frames[:3]:
+        world.forget(frame, np.flatnonzero(frame.point_ids == 0))
+    world.add_keyframe(frames[3])
+    world.add_points(frames[3], np.array([1]))
+    assert frames[3].point_ids[1] == 0
+    np.testing.assert_array_equal(world.current(everything), [0, 1, 1])
+
+
 def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
     world = Map(CAMERA)
     first, second = keyframe(0, [-1, -1, -1, -1]), keyframe(1, [-1, TWICE, RARELY_FOUND, -1])

@@ -88,6 +88,26 @@ class Still:
         self.waits.append(moment)
 
 
+def test_an_answer_ends_the_latency_and_half_the_time_between_views_is_soon_over() -> None:
+    source, clock = Gated(3), Still()
+    source.allowed.release(2)
+    late = []
+    with Paced(source, clock) as paced:
+        for taken in paced:
+            assert not paced.late()
+            if taken.name == "1":
+                source.let(1)
+            if taken.name == "2":
+                clock.time = 2.2 / 30
+                paced.answered()
+                for moment in (2.45, 2.55):
+                    clock.time = moment / 30
+                    late.append(paced.late())
+                source.allowed.release()
+    assert late == [False, True]
+    np.testing.assert_allclose(paced.latencies, [-1 / 30, 0.2 / 30], atol=1e-9)  # the clock stood still for the first
+
+
 def test_views_that_come_while_the_tracker_is_busy_are_dropped_and_counted() -> None:
     source, clock = Gated(9), Still()
     source.allowed.release(2)
