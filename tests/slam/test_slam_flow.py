@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.features import Corners
-from cohdc_train.slam.flow_tracking import Followed, FlowTracker
+from cohdc_train.slam.flow_tracking import FlowTracker, Followed
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.motion import Expectation
