@@ -61,7 +61,7 @@ class LocalMapping:
             self._finish_parts()
 
     def work(self) -> None:
-        """One part of what is left, and what bundle adjustment has found meanwhile. Keyframes may move."""
+        """One part of what is left, if anything. Keyframes may move."""
         if self._parts:
             self._parts.popleft()()
 

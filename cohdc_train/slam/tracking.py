@@ -77,9 +77,7 @@ class Tracker:
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
         in_parts = self._flow is not None
-        self._mapping = LocalMapping(
-            self.map, self._weighing, self.method, self._refiner, seed, executor, in_parts=in_parts
-        )
+        self._mapping = LocalMapping(self.map, self._weighing, self.method, self._refiner, seed, executor, in_parts)
         self._hurry = hurry
         self._motion = Motion()
         self._last: Fit | None = None
@@ -127,10 +125,11 @@ class Tracker:
         keyframe = fit is not None and can_join and self._wants_keyframe(fit)
         if fit is not None and keyframe:
             fit = self._add_keyframe(frame, fit)
-        if self._flow is not None and fit is not flown:
+        matched = fit is None or fit is not flown
+        if self._flow is not None and matched:
             assert self.features is not None
             self._flow.begin(rgb, self.features, fit, mask)
-        self._remember(fit, frame, matched=fit is not flown)
+        self._remember(fit, frame, matched)
         return answer.pose(fit, keyframe)
 
     def finish(self) -> None:
@@ -226,7 +225,10 @@ class Tracker:
         index = last.reference.index
         before = self.map.pose(index)
         work()
-        motion = inverse(before) @ self.map.pose(index)
+        after = self.map.pose(index)
+        if np.array_equal(before, after):
+            return
+        motion = inverse(before) @ after
         self._last = replace(last, T_cw=last.T_cw @ motion)
         self._motion.carry(motion)
 
