@@ -1,4 +1,5 @@
-"""Frames between two that are matched against the map: optical flow finds the points that the last matched one saw.
+"""A frame's pose at once, before it is matched against the map or without: optical flow finds the points that the last
+matched one saw.
 
 Corners, descriptors and the search for both take most of a frame's time. A thirtieth of a second later the same points
 are a few pixels on, and the patch around each says where. Flow starts from the matched frame every time, never from a
@@ -54,7 +55,7 @@ class Followed:
 
 
 class FlowTracker:
-    """The poses of up to two frames after every matched one, without corners of their own."""
+    """The poses of the frames after a matched one, without corners of their own."""
 
     def __init__(self, world: Map, weighing: Weighing) -> None:
         self.map = world

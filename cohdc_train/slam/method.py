@@ -18,7 +18,7 @@ class Method:
         every_frame: in that adjustment what frames between keyframes saw counts as well.
         smoothing: when the sequence is over, frames' poses are made to agree with how a hand moves, by what each saw.
         keyframe_culling: a keyframe leaves the map when three others see nine in ten of its points as well.
-        flow: in real time two of three frames are tracked by optical flow from the third, which is matched to the map.
+        flow: in real time optical flow says where a frame is, and every third is matched to the map after that.
     """
 
     loops: bool = True
