@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.background_mapping import NICE
 from cohdc_train.slam.culling import Mask, grow
 from cohdc_train.slam.propagation import Half, Propagation, halve, halve_mask
 from cohdc_train.slam.slot import Slot
@@ -20,7 +21,6 @@ from cohdc_train.slam.source import View
 Outline = Callable[[View], tuple[Mask, float]]
 
 _WIDEN = 30.0  # px per second of a mask's age
-_NICE = 15  # the worker gives way to tracking when there are fewer cores than work
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class AsyncMasks:
 
     def _work(self) -> None:
         if sys.platform == "linux":
-            os.nice(_NICE)  # there it is this thread's alone
+            os.nice(NICE)  # there it is this thread's alone
         try:
             while (job := self._jobs.take()) is not None:
                 start = time.perf_counter()

@@ -18,7 +18,7 @@ from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.optimization import Array, Weighing
 from cohdc_train.slam.window import Solution, Window, close_window, open_window, solve
 
-_NICE = 15  # the worker gives way to tracking when there are fewer cores than work
+NICE = 15  # a worker gives way to tracking when there are fewer cores than work
 
 
 class BackgroundMapper:
@@ -77,4 +77,4 @@ def worker_process() -> Iterator[Executor]:
 def _give_way() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
     if hasattr(os, "nice"):
-        os.nice(_NICE)
+        os.nice(NICE)

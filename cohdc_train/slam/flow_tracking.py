@@ -85,9 +85,9 @@ class FlowTracker:
 
         rgb: [H, W, 3]; mask: [H, W] bool, True = dynamic: nothing is followed to there; T_cw: [4, 4] expected pose.
         """
-        self._followed += 1
         if self._start is None:
             return None
+        self._followed += 1
         before = self._start
         guess = (self._seen_from(T_cw, before.fit.matches.points) + before.off).astype(np.float32)
         starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW

@@ -1,7 +1,7 @@
 """All that follows when a keyframe joins the map: at once, or a part per frame where time is short."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Executor
 
 from cohdc_train.slam.alignment import Picture
@@ -96,9 +96,6 @@ class LocalMapping:
             self._loops.close(keyframe, picture())
             in_use = in_use | self._loops.ends
         if self._culls_keyframes:
-            self._forget(cull_keyframes(self._world, keyframe, in_use))
-
-    def _forget(self, keyframes: Iterable[Keyframe]) -> None:
-        if self._loops is not None:
-            for keyframe in keyframes:
-                self._loops.forget(keyframe)
+            for removed in cull_keyframes(self._world, keyframe, in_use):
+                if self._loops is not None:
+                    self._loops.forget(removed)

@@ -59,7 +59,7 @@ class Paced:
         self._slot: Slot[tuple[View, float]] = Slot()
         self._stop = threading.Event()
         self._reader: threading.Thread | None = None
-        self._due: float | None = None  # of the view that was given out last
+        self._due = float("inf")  # when the view was that was given out last
         self._answered = True
         self._between = float("inf")  # s, from one view to the next
 
@@ -70,11 +70,11 @@ class Paced:
 
     def late(self) -> bool:
         """Whether half of the time has gone that lies between views, so that work would hold up the next."""
-        return self._due is not None and self._clock.now() > self._due + self._between / 2
+        return self._clock.now() > self._due + self._between / 2
 
     def answered(self) -> None:
         """What was wanted of the latest view is known."""
-        if self._due is not None and not self._answered:
+        if not self._answered:
             self.latencies.append(self._clock.now() - self._due)
             self._answered = True
 

@@ -129,17 +129,16 @@ def run_source(
         part = Path(folder)
         with ExitStack() as stack:
             beside = stack.enter_context(workers(source, maker)) if realtime else None
-            tracker = Tracker(source.camera, features, seed, method)
-            if beside is not None:
-                tracker = Tracker(source.camera, features, seed, method, beside.executor, beside.source.late)
-                on_pose = beside.answering(on_pose)
+            in_time = (beside.executor, beside.source.late) if beside else ()
+            tracker = Tracker(source.camera, features, seed, method, *in_time)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
             watchers = [files, *watchers]
             if view or rrd is not None:
                 watchers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
             stack.enter_context(stopped_by_ctrl_c(source))
             views, mask_of = (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
-            records = play(tracker, views, mask_of, part / "pictures", watchers, on_pose)
+            answer = beside.answering(on_pose) if beside else on_pose
+            records = play(tracker, views, mask_of, part / "pictures", watchers, answer)
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops, "without_depth": source.without_depth}

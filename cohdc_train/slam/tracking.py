@@ -27,7 +27,8 @@ from cohdc_train.slam.refinement import Refiner
 from cohdc_train.slam.shutter import unrolled
 
 MIN_START = 50  # points a first keyframe needs
-_KEYFRAME = 0.82, 20  # share of the inliers right after the last keyframe, and frames since: one makes the next due
+_KEYFRAME_SHARE = 0.82  # of the inliers right after the last keyframe: with fewer the next is due
+_KEYFRAME_FRAMES = 20  # after which it is due in any case
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
@@ -238,8 +239,8 @@ class Tracker:
         old = self.map.born[: self.map.size] < self.map.joined - _OLD
         if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
             return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
-        share, frames = _KEYFRAME
-        return self._since_keyframe >= frames or len(fit.matches) < share * self._reference_inliers
+        fewer = len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
+        return fewer or self._since_keyframe >= _KEYFRAME_FRAMES
 
     def _add_keyframe(self, frame: _Frame, fit: Fit) -> Fit:
         """Take the frame into the map. Returns its fit there, which the motion goes along with."""

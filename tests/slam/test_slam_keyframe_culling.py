@@ -25,7 +25,8 @@ def sway(rounds: int, **parts: bool) -> Tracker:
     tracker = Tracker(CAMERA, features=250, method=Method(**parts))
     views = [render(room(), T_wc)[:2] for T_wc in PATH]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cohdc_train.slam.tracking._KEYFRAME", (0.75, 2))
+        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_SHARE", 0.75)
+        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 2)
         patch.setattr("cohdc_train.slam.tracking._OLD", 1000)
         for number in range(rounds * ROUND):
             assert tracker.track(*views[number % ROUND], number / 30).tracked
@@ -71,7 +72,8 @@ def test_a_known_place_needs_no_keyframe() -> None:
     rgb, depth, _ = render(room(), PATH[0])
     tracker = Tracker(CAMERA, features=250)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cohdc_train.slam.tracking._KEYFRAME", (0.75, 1))
+        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_SHARE", 0.75)
+        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 1)
         for number in range(12):
             tracker.track(rgb, depth, number / 30)
     later = [tracker.track(rgb, depth, (12 + number) / 30) for number in range(120)]
