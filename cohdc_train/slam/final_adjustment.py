@@ -19,7 +19,7 @@ from cohdc_train.slam.optimization import Array, Observations, Weighing
 from cohdc_train.slam.window import Sighting, adjust_everything
 
 _MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
-_TURNS = 2  # a frame gives only every second of its points, another one the others: a quarter of the time
+_TURNS = 2  # a matched frame gives only every second of its points, another one the others: a quarter of the time
 
 
 class _Kept(NamedTuple):
@@ -40,8 +40,8 @@ class SeenFrames:
         self._every = 1
         self._count = 0
 
-    def chosen(self, fit: Fit) -> Matches | None:
-        """What is wanted of the next settled frame, if anything.
+    def chosen(self, fit: Fit, matched: bool) -> Matches | None:
+        """What is wanted of the next settled frame, if anything; matched: against the map, so that it saw all it can.
 
         One that saw little is not kept: what it gives would not do for a pose.
         """
@@ -50,6 +50,8 @@ class SeenFrames:
         number, self._count = self._count, self._count + 1
         if number % self._every:
             return None
+        if not matched:
+            return fit.matches
         turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
         return fit.matches.take((fit.matches.points + turn) % _TURNS == 0)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cohdc_train.slam.camera import Camera
 from cohdc_train.slam.features import Corners, Features, gray_of
 from cohdc_train.slam.localization import Fit
-from cohdc_train.slam.map import Map
+from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.matching import Matches
 from cohdc_train.slam.motion import Expectation
 from cohdc_train.slam.optimization import Array, Weighing, optimize_pose, pose_information, to_local
@@ -25,6 +25,8 @@ _AT_MOST = 5  # while there is no time for more
 _WINDOW = (13, 13)  # px of a patch
 _LEVELS = 2  # of the image pyramid above the image itself
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+_MANY = 500  # points, of which a frame follows only
+_TURNS = 2  # every second, the next one the others: a pose needs no more, and most of the time goes into them
 _LEAST = 50  # points that agree on a pose
 _SHARE = 0.4  # of the points that set out, that agree on a pose
 _MUCH_HAS_CHANGED = 0.6  # of them: where fewer agree, the frame is to be matched
@@ -35,15 +37,22 @@ _NEAR = 0.05  # m
 class _Start:
     """A matched frame.
 
-    gray: [H, W] uint8; corners: those that are matched, in the order of the fit's matches; off: [m, 2] px by which each
-    lies beside its point's projection; masked: [m] bool, it was matched though a mask was given for it.
+    gray: [H, W] uint8; ids: [m] int64 points that are matched; corners: where, m of them; off: [m, 2] px by which each
+    lies beside its point's projection; masked: [m] bool, it was matched though a mask was given for it; reference: the
+    keyframe that sees most of the points.
     """
 
     gray: NDArray[np.uint8]
+    ids: NDArray[np.int64]
     corners: Corners
-    fit: Fit
     off: Array
     masked: NDArray[np.bool_]
+    reference: Keyframe | None
+
+    def take(self, rows: NDArray[np.bool_]) -> "_Start":
+        """The same with the chosen points."""
+        ids, corners = self.ids[rows], self.corners.take(rows)
+        return replace(self, ids=ids, corners=corners, off=self.off[rows], masked=self.masked[rows])
 
 
 @dataclass(frozen=True)
@@ -62,7 +71,7 @@ class FlowTracker:
         self._weighing = weighing
         self._start: _Start | None = None
         self._followed = 0
-        self._agree = 0  # points
+        self._set_out = self._agree = 0  # points
 
     def begin(
         self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None, mask: NDArray[np.bool_] | None
@@ -78,7 +87,8 @@ class FlowTracker:
         rows = fit.matches.corners
         corners = features.corners(rows)
         off = corners.pixels - self._seen_from(fit.T_cw, fit.matches.points)
-        self._start = _Start(gray_of(rgb), corners, fit, off, _covered(corners.pixels, mask))
+        masked = _covered(corners.pixels, mask)
+        self._start = _Start(gray_of(rgb), fit.matches.points, corners, off, masked, fit.reference)
 
     def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
         """Look for the points in the next frame; None when there is nothing to look for.
@@ -89,7 +99,10 @@ class FlowTracker:
             return None
         self._followed += 1
         before = self._start
-        guess = (self._seen_from(T_cw, before.fit.matches.points) + before.off).astype(np.float32)
+        if len(before.ids) >= _MANY:
+            before = before.take(before.ids % _TURNS == self._followed % _TURNS)
+        self._set_out = len(before.ids)
+        guess = (self._seen_from(T_cw, before.ids) + before.off).astype(np.float32)
         starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             before.gray, gray_of(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
@@ -97,7 +110,7 @@ class FlowTracker:
         pixels = np.asarray(found, dtype=np.float64)
         rows = np.flatnonzero((status[:, 0] > 0) & _inside(pixels, self.map.camera))
         rows = rows[before.masked[rows] | ~_covered(pixels[rows], mask)]
-        known = before.fit.matches.points[rows]
+        known = before.ids[rows]
         ids, first = np.unique(self.map.current(known), return_index=True)
         rows, same = rows[first], ids == known[first]
         corners = before.corners.take(rows)
@@ -106,7 +119,7 @@ class FlowTracker:
     def locate(self, followed: Followed, features: Features, expected: Expectation) -> Fit | None:
         """The pose on which enough of the points agree. features: of the followed corners."""
         assert self._start is not None
-        least = max(_LEAST, _SHARE * len(self._start.fit.matches))
+        least = max(_LEAST, _SHARE * self._set_out)
         if len(features) < least:
             return None
         matches = Matches(followed.ids, np.arange(len(features)))
@@ -117,14 +130,22 @@ class FlowTracker:
         if self._agree < least:
             return None
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
-        return Fit(T_cw, matches.take(inlier), self._start.fit.reference, prior, information)
+        return Fit(T_cw, matches.take(inlier), self._start.reference, prior, information)
 
-    def over(self, hurry: bool) -> bool:
-        """Whether the frame that was followed to is to be matched, and be begun from. hurry: it may wait."""
+    @property
+    def left(self) -> float:
+        """Share of the points that the matched frame saw, of which flow made the latest answer: a view that changes loses
+        them."""
+        return self._agree / self._set_out
+
+    def over(self, hurry: bool, busy: bool = False) -> bool:
+        """Whether the frame that was followed to is to be matched, and be begun from.
+
+        hurry: it may wait; busy: it would not become a keyframe, so that it may wait unless much has changed.
+        """
         if hurry:
             return self._followed > _AT_MOST
-        assert self._start is not None
-        return self._followed > _BETWEEN or self._agree < _MUCH_HAS_CHANGED * len(self._start.fit.matches)
+        return self._followed > (_AT_MOST if busy else _BETWEEN) or self.left < _MUCH_HAS_CHANGED
 
     def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
         """[m, 2] px as the lens shows them, of points of the map."""

@@ -45,13 +45,18 @@ class LocalMapping:
         """How many loops were closed."""
         return 0 if self._loops is None else self._loops.closed
 
+    @property
+    def busy(self) -> bool:
+        """Whether something is left to do of the latest keyframe."""
+        return bool(self._parts)
+
     def insert(self, keyframe: Keyframe, picture: Callable[[], Picture]) -> None:
         """A tracked keyframe joins, and its corners of known depth become points. Then: duplicates merged, bundle
         adjustment, weak points out; loops, superfluous keyframes out.
 
-        picture: makes what loop closing keeps of it.
+        picture: makes what loop closing keeps of it. Must not be called while `busy`.
         """
-        self._finish_parts()
+        assert not self.busy
         self._world.add_keyframe(keyframe)
         add_points(self._world, keyframe)
         if self._refiner is not None:

@@ -158,9 +158,11 @@ class Map:
             self.forget(keyframe, changed)
             taken = np.zeros(self.size + 1, dtype=np.bool_)
             taken[keyframe.point_ids] = True
-            moved, first = np.unique(ids[changed], return_index=True)
-            fresh = ~taken[moved]
-            self.observe(keyframe, Matches(moved[fresh], changed[first[fresh]]))
+            heirs = ids[changed]
+            corner = np.full(self.size + 1, -1)
+            corner[heirs[::-1]] = changed[::-1]
+            keep = ~taken[heirs] & (corner[heirs] == changed)
+            self.observe(keyframe, Matches(heirs[keep], changed[keep]))
 
     def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """[n] what the points `ids` have become, by however many steps: themselves where none took them over."""
@@ -225,6 +227,13 @@ class Map:
         flags = np.zeros(self.size + 1, dtype=np.bool_)
         for keyframe in keyframes:
             flags[keyframe.point_ids] = True
+        return np.flatnonzero(flags[:-1])
+
+    def unseen(self, ids: NDArray[np.int64], keyframe: Keyframe) -> NDArray[np.int64]:
+        """Those of the points that a keyframe does not see, rising, each once."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        flags[ids] = True
+        flags[keyframe.point_ids] = False
         return np.flatnonzero(flags[:-1])
 
     def project(self, ids: NDArray[np.int64], T_cw: Array) -> Projected:

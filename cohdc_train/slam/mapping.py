@@ -23,30 +23,43 @@ def add_points(world: Map, keyframe: Keyframe) -> None:
 
 def fuse(world: Map, keyframe: Keyframe) -> None:
     """Look for the keyframe's points in its neighbours: more measurements; duplicates become the older point."""
-    neighbours = [k for k in world.covisible(keyframe.seen_points(), _FUSE_KEYFRAMES + 1) if k is not keyframe]
-    for other in neighbours:
-        fuse_into(world, keyframe.seen_points(), other, [keyframe, *neighbours])
+    ids = keyframe.seen_points()
+    neighbours = [k for k in world.covisible(ids, _FUSE_KEYFRAMES + 1) if k is not keyframe]
+    pairs = [_look_for(world, ids, other) for other in neighbours]
+    if pairs:
+        _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbours])
 
 
 def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]) -> None:
     """Look for points in one keyframe that may not know them yet; `keyframes` are all that may hold duplicates."""
-    ids = np.setdiff1d(ids, other.seen_points())
-    matches = match_projected(world.project(ids, other.T_cw), other.features, radius=3.0, max_distance=60)
+    _merge(world, _look_for(world, ids, other), keyframes)
+
+
+def _look_for(world: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np.int64]:
+    """Look for points in one keyframe, where they become measurements of corners that belong to none.
+
+    Returns [2, k] such points, and those that their corners belong to.
+    """
+    projected = world.project(world.unseen(ids, other), other.T_cw)
+    matches = match_projected(projected, other.features, radius=3.0, max_distance=60)
     current = other.point_ids[matches.corners]
     world.observe(other, matches.take(current < 0))
-    known = matches.take(current >= 0)
-    if len(known):
-        _merge(world, known.points, other.point_ids[known.corners], keyframes)
+    return np.stack([matches.points, current])[:, current >= 0]
 
 
-def _merge(world: Map, first: NDArray[np.int64], second: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
-    near = np.linalg.norm(world.positions[first] - world.positions[second], axis=1) < 0.05
-    first, second = first[near], second[near]
+def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
+    """Of pairs [2, k] of points that look alike, those that are near each other become one."""
+    near = np.linalg.norm(world.positions[pairs[0]] - world.positions[pairs[1]], axis=1) < 0.05
+    first, second = pairs[:, near]
+    if len(first) == 0:
+        return
     later = world.born[first] - world.born[second]
     older = np.where(later == 0, first < second, later < 0)  # one order of all points, so that no two swap places
     old, new = np.where(older, second, first), np.where(older, first, second)
-    chained = np.isin(new, old)  # a point that itself gives way this time waits for the next keyframe
-    world.replace(old[~chained], new[~chained], keyframes)
+    gives_way = np.zeros(world.size, dtype=np.bool_)
+    gives_way[old] = True
+    stays = ~gives_way[new]  # a point that itself gives way this time waits for the next keyframe
+    world.replace(old[stays], new[stays], keyframes)
 
 
 def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -112,8 +111,14 @@ def match_descriptors(
     """Mutually nearest descriptors without any idea of the pose. ids: [m]; descriptors: [m, 4] of the map points."""
     if len(ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-    found = matcher.match(descriptors.view(np.uint8), features.descriptors.view(np.uint8))
-    rows = np.array([(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_distance], dtype=np.int64)
-    rows = rows.reshape(-1, 2)
-    return Matches(ids[rows[:, 0]], rows[:, 1])
+    alike = _signs(descriptors) @ _signs(features.descriptors).T  # 256 bits less twice those that differ
+    nearest = alike.argmax(axis=1)
+    rows = np.flatnonzero(alike.argmax(axis=0)[nearest] == np.arange(len(ids)))
+    rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * max_distance]
+    return Matches(ids[rows], nearest[rows])
+
+
+def _signs(descriptors: NDArray[np.uint64]) -> NDArray[np.float32]:
+    """[m, 256] 1 for each set bit of descriptors [m, 4], -1 for each other."""
+    bits = np.unpackbits(np.ascontiguousarray(descriptors).view(np.uint8).reshape(-1, 32), axis=1)
+    return bits.astype(np.float32) * 2 - 1

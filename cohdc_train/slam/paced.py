@@ -1,5 +1,6 @@
 """Views at the pace of their stamps: whoever is late finds the newest one, and the others are dropped and counted."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -68,9 +69,11 @@ class Paced:
         """Views that were not given out."""
         return self._slot.dropped
 
-    def late(self) -> bool:
-        """Whether half of the time has gone that lies between views, so that work would hold up the next."""
-        return self._clock.now() > self._due + self._between / 2
+    def spent(self) -> float:
+        """Share of the time between views that has gone since the latest was due; work beyond 1 holds up the next."""
+        if not math.isfinite(self._between):
+            return 0.0
+        return (self._clock.now() - self._due) / max(self._between, 1e-6)
 
     def answered(self) -> None:
         """What was wanted of the latest view is known."""

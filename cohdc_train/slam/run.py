@@ -129,7 +129,7 @@ def run_source(
         part = Path(folder)
         with ExitStack() as stack:
             beside = stack.enter_context(workers(source, maker)) if realtime else None
-            in_time = (beside.executor, beside.source.late) if beside else ()
+            in_time = (beside.executor, beside.source.spent) if beside else ()
             tracker = Tracker(source.camera, features, seed, method, *in_time)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
             watchers = [files, *watchers]

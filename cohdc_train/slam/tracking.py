@@ -32,6 +32,8 @@ _KEYFRAME_FRAMES = 20  # after which it is due in any case
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
 _KNOWN_SHARE = 0.7  # of the old points of the reference keyframe; where a known place is seen less well, it has changed
+_MATCHES_UNTIL = 0.5  # of the time until the next frame has gone: matching takes about one whole, and two are too many
+_WORKS_UNTIL = 0.75  # the same for mapping, whose parts take half
 _CERTAIN = 1e9  # information of the first pose, which is where the world begins
 
 _Mask = NDArray[np.bool_]
@@ -52,7 +54,8 @@ class Tracker:
     """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit.
 
     With an executor bundle adjustment runs there, beside tracking (`background_mapping`); poses then depend on time.
-    hurry: asked when a frame's pose is known, whether work would hold up the next frame; what can be put off then is.
+    spent: asked when a frame's pose is known, which share of the time until the next frame has gone; what would hold
+    that one up is put off.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class Tracker:
         seed: int = 0,
         method: Method | None = None,
         executor: Executor | None = None,
-        hurry: Callable[[], bool] = lambda: False,
+        spent: Callable[[], float] = lambda: 0.0,
     ) -> None:
         self.camera = camera
         self.method = method or Method()
@@ -79,10 +82,10 @@ class Tracker:
         self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
         in_parts = self._flow is not None
         self._mapping = LocalMapping(self.map, self._weighing, self.method, self._refiner, seed, executor, in_parts)
-        self._hurry = hurry
+        self._spent = spent
         self._motion = Motion()
         self._last: Fit | None = None
-        self._reference_inliers = 0
+        self._reference_inliers = 0.0
         self._since_keyframe = 0
         self._log = FrameLog()
         self._seen = SeenFrames()
@@ -111,26 +114,32 @@ class Tracker:
         flown = None if self._flow is None or expected is None else self._by_flow(self._flow, frame, expected)
         if flown is not None:
             answer.give(flown)
-            hurry = self._hurry()
+            spent = self._spent()
             assert self._flow is not None
-            if not self._flow.over(hurry):
+            if not self._flow.over(spent > _MATCHES_UNTIL, self._mapping.busy):
                 self._motion.found(t, flown.T_cw, flown.information, flown.pull)
-                self._remember(flown, frame, matched=False, hurry=hurry)
-                if not hurry:
+                self._remember(flown, frame, matched=False, hurry=spent > _WORKS_UNTIL)
+                if spent <= _WORKS_UNTIL:
                     self._let(self._mapping.work)
                 return answer.pose(flown, keyframe=False)
         fit, can_join = self._by_map(frame, expected, flown)
         answer.give(fit)
         if fit is not None:
             self._motion.found(t, fit.T_cw, fit.information, fit.pull)
-        keyframe = fit is not None and can_join and self._wants_keyframe(fit)
+        wanted = fit is not None and can_join and self._wants_keyframe(fit)
+        keyframe = wanted and not self._mapping.busy
         if fit is not None and keyframe:
             fit = self._add_keyframe(frame, fit)
         matched = fit is None or fit is not flown
+        if fit is not None and matched and not keyframe:
+            left = 1.0 if self._flow is None or flown is None else self._flow.left
+            self._reference_inliers = max(self._reference_inliers, len(fit.matches) / left)
         if self._flow is not None and matched:
             assert self.features is not None
             self._flow.begin(rgb, self.features, fit, mask)
         self._remember(fit, frame, matched)
+        if wanted and not keyframe:
+            self._let(self._mapping.work)
         return answer.pose(fit, keyframe)
 
     def finish(self) -> None:
@@ -253,7 +262,7 @@ class Tracker:
         self._mapping.insert(keyframe, lambda: take_picture(frame.rgb, frame.depth_m, mask, self.camera))
         self._motion.carry(inverse(fit.T_cw) @ keyframe.T_cw)
         self._since_keyframe = 0
-        self._reference_inliers = 0
+        self._reference_inliers = 0.0
         corners = np.flatnonzero(keyframe.point_ids >= 0)
         matches = Matches(keyframe.point_ids[corners], corners)
         return Fit(keyframe.T_cw, matches, keyframe, information=fit.information)
@@ -265,11 +274,9 @@ class Tracker:
             self._dynamic_mask.forget()
             return
         self._last = fit
-        if self._since_keyframe > 0 and matched:
-            self._reference_inliers = max(self._reference_inliers, len(fit.matches))
         self._since_keyframe += 1
         row = self._log.append(frame.t, fit, self.map)
-        chosen = self._seen.chosen(fit) if self.method.every_frame else None
+        chosen = self._seen.chosen(fit, matched) if self.method.every_frame else None
         if chosen is None:
             return
         assert self.features is not None

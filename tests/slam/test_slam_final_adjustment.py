@@ -71,7 +71,7 @@ def remember(seen: SeenFrames, row: int, tracker: Tracker) -> None:
     """The tracker's latest frame, as one in that row of the log."""
     assert tracker._last is not None
     assert tracker.features is not None
-    chosen = seen.chosen(tracker._last)
+    chosen = seen.chosen(tracker._last, matched=True)
     if chosen is not None:
         seen.append(row, chosen, tracker.features, tracker.map)
 
@@ -134,7 +134,7 @@ def test_a_frame_that_saw_little_is_not_kept(tracker: Tracker) -> None:
     assert fit is not None
     for points, wanted in ((2 * FEW - 1, False), (2 * FEW, True)):
         few = replace(fit, matches=fit.matches.take(np.arange(points)))
-        assert (seen.chosen(few) is not None) == wanted
+        assert (seen.chosen(few, matched=True) is not None) == wanted
 
 
 def test_a_row_that_a_younger_point_has_taken_says_nothing(tracker: Tracker) -> None:

@@ -35,8 +35,8 @@ class Watched:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, flow: bool = True) -> None:
         method = Method(flow=flow, global_adjustment=False, smoothing=False)
-        self.hurry = False
-        self.tracker = Tracker(CAMERA, 500, method=method, executor=AtOnce(), hurry=lambda: self.hurry)
+        self.spent = 0.0
+        self.tracker = Tracker(CAMERA, 500, method=method, executor=AtOnce(), spent=lambda: self.spent)
         self.searched: list[int] = []
         self.poses: list[Pose] = []
         find = self.tracker._extract.find
@@ -109,12 +109,12 @@ def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
 
     monkeypatch.setattr(run.tracker._mapping, "work", noted)
     run.track(views[0])
-    run.hurry = True
+    run.spent = 0.8
     for view in views[1:14]:
         assert run.track(view).tracked
     assert run.searched == [0, 6, 12]
     assert min(worked, default=99) >= 6, "a keyframe that follows lets what is left of the one before be done"
-    run.hurry = False
+    run.spent = 0.0
     for view in views[14:20]:
         run.track(view)
     assert run.searched == [0, 6, 12, 15, 18]
@@ -278,9 +278,9 @@ def test_few_points_are_weighed_against_what_was_expected(views: list[View]) -> 
     followed = flow.follow(views[0][0], None, np.eye(4))
     assert followed is not None
     features = tracker._extract.measure(followed.corners, views[0][1])
-    assert flow._start is not None
+    assert tracker._last is not None
     some = np.arange(100)
-    few = replace(flow._start.fit, matches=Matches(followed.ids[some], some))
+    few = replace(tracker._last, matches=Matches(followed.ids[some], some))
     flow.begin(views[0][0], features, few, None)
     again = flow.follow(views[0][0], None, np.eye(4))
     assert again is not None

@@ -88,13 +88,13 @@ class Still:
         self.waits.append(moment)
 
 
-def test_an_answer_ends_the_latency_and_half_the_time_between_views_is_soon_over() -> None:
+def test_an_answer_ends_the_latency_and_the_time_until_the_next_view_is_spent() -> None:
     source, clock = Gated(3), Still()
     source.allowed.release(2)
-    late = []
+    spent = []
     with Paced(source, clock) as paced:
         for taken in paced:
-            assert not paced.late()
+            assert paced.spent() <= 0
             if taken.name == "1":
                 source.let(1)
             if taken.name == "2":
@@ -102,9 +102,9 @@ def test_an_answer_ends_the_latency_and_half_the_time_between_views_is_soon_over
                 paced.answered()
                 for moment in (2.45, 2.55):
                     clock.time = moment / 30
-                    late.append(paced.late())
+                    spent.append(paced.spent())
                 source.allowed.release()
-    assert late == [False, True]
+    np.testing.assert_allclose(spent, [0.45, 0.55])
     np.testing.assert_allclose(paced.latencies, [-1 / 30, 0.2 / 30], atol=1e-9)  # the clock stood still for the first
 
 
