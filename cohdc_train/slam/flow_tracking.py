@@ -49,7 +49,7 @@ class _Start:
     masked: NDArray[np.bool_]
     reference: Keyframe | None
 
-    def take(self, rows: NDArray[np.bool_]) -> "_Start":
+    def take(self, rows: NDArray[np.int64]) -> "_Start":
         """The same with the chosen points."""
         ids, corners = self.ids[rows], self.corners.take(rows)
         return replace(self, ids=ids, corners=corners, off=self.off[rows], masked=self.masked[rows])
@@ -100,7 +100,7 @@ class FlowTracker:
         self._followed += 1
         before = self._start
         if len(before.ids) >= _MANY:
-            before = before.take(before.ids % _TURNS == self._followed % _TURNS)
+            before = before.take(np.flatnonzero(before.ids % _TURNS == self._followed % _TURNS))
         self._set_out = len(before.ids)
         guess = (self._seen_from(T_cw, before.ids) + before.off).astype(np.float32)
         starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -134,8 +134,7 @@ class FlowTracker:
 
     @property
     def left(self) -> float:
-        """Share of the points that the matched frame saw, of which flow made the latest answer: a view that changes loses
-        them."""
+        """Share of the points that set out on which the latest answer stands: a view that changes loses them."""
         return self._agree / self._set_out
 
     def over(self, hurry: bool, busy: bool = False) -> bool:

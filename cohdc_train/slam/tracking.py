@@ -28,6 +28,7 @@ from cohdc_train.slam.shutter import unrolled
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.82  # of the inliers right after the last keyframe: with fewer the next is due
+_SELDOM_ASKED_SHARE = 0.86  # the same where flow tracks, and only every third frame can become one
 _KEYFRAME_FRAMES = 20  # after which it is due in any case
 _OLD = 10  # keyframes ago that a point joined the map: what is seen there is no new place
 _KNOWN = 0.9  # share of a frame's points that are old, from which on its place is known
@@ -248,7 +249,8 @@ class Tracker:
         old = self.map.born[: self.map.size] < self.map.joined - _OLD
         if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
             return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
-        fewer = len(fit.matches) < _KEYFRAME_SHARE * self._reference_inliers
+        share = _KEYFRAME_SHARE if self._flow is None else _SELDOM_ASKED_SHARE
+        fewer = len(fit.matches) < share * self._reference_inliers
         return fewer or self._since_keyframe >= _KEYFRAME_FRAMES
 
     def _add_keyframe(self, frame: _Frame, fit: Fit) -> Fit:

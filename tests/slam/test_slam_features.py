@@ -11,6 +11,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
 from cohdc_train.slam.culling import Culling, dynamic_mask, grow
 from cohdc_train.slam.features import FeatureExtractor, Features, hamming, sample_depth, spread
+from cohdc_train.slam.matching import match_descriptors
 
 
 def test_the_mask_costs_no_budget() -> None:
@@ -157,3 +158,18 @@ def test_grow_is_a_disc() -> None:
 def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(DataError, match=next(iter(bad))):
         Culling(**bad)  # type: ignore[arg-type]
+
+
+def test_mutually_nearest_descriptors_are_those_of_a_search_through_all() -> None:
+    rng = np.random.default_rng(0)
+    there = rng.integers(0, 2**63, (40, 4)).astype(np.uint64)
+    here = np.concatenate([there[rng.permutation(40)[:25]], rng.integers(0, 2**63, (20, 4)).astype(np.uint64)])
+    here[:, 0] ^= np.uint64(2) ** rng.integers(0, 30, len(here)).astype(np.uint64)
+    n = len(here)
+    features = Features(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n, np.int64), here, np.zeros(n), np.zeros(n, bool))
+    matches = match_descriptors(np.arange(100, 140), there, features)
+    bits = hamming(there[:, None], here)
+    nearest = (bits == bits.min(axis=0)) & (bits == bits.min(axis=1, keepdims=True)) & (bits <= 60)
+    pairs = {(100 + i, j) for i, j in np.argwhere(nearest).tolist()}
+    assert set(zip(matches.points.tolist(), matches.corners.tolist(), strict=True)) == pairs
+    assert len(pairs) == 25

@@ -100,6 +100,7 @@ def test_the_answer_by_flow_comes_before_the_frame_is_matched(
 def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 1)
     run = Watched(monkeypatch)
     work, worked = run.tracker._mapping.work, list[int]()
 
@@ -113,12 +114,19 @@ def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
     for view in views[1:14]:
         assert run.track(view).tracked
     assert run.searched == [0, 6, 12]
-    assert min(worked, default=99) >= 6, "a keyframe that follows lets what is left of the one before be done"
+    assert worked == [6, 12], "in place of a keyframe, which waits until all is done for the one before"
+    assert [pose.keyframe for pose in run.poses] == [True] + [False] * 13
     run.spent = 0.0
     for view in views[14:20]:
         run.track(view)
     assert run.searched == [0, 6, 12, 15, 18]
-    assert {14, 16, 17} <= set(worked)
+    assert worked == [6, 12, 14, 16, 17, 19]
+    assert [index for index, pose in enumerate(run.poses) if pose.keyframe] == [0, 15, 18]
+    run.spent = 0.6
+    for view in views[20:22]:
+        run.track(view)
+    assert worked[-2:] == [20, 21], "there is time for a part yet"
+    assert run.searched[-1] == 18, "but for no search"
 
 
 def test_a_keyframes_upkeep_is_done_in_parts_while_flow_tracks(
@@ -149,6 +157,21 @@ def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become
     assert old not in again.ids
     assert np.count_nonzero(again.ids == new) == 1, "no point is followed twice"
     tracker.map.became[old] = -1
+
+
+def test_of_many_points_a_frame_follows_every_second_and_the_next_the_others(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flow, tracker = begun(views[0])
+    assert tracker._last is not None
+    every = flow.follow(views[0][0], None, np.eye(4))
+    monkeypatch.setattr("cohdc_train.slam.flow_tracking._MANY", len(tracker._last.matches))
+    some, others = (flow.follow(views[0][0], None, np.eye(4)) for _ in range(2))
+    assert every is not None
+    assert some is not None
+    assert others is not None
+    np.testing.assert_array_equal(np.sort(np.r_[some.ids, others.ids]), every.ids)
+    assert 0.8 < len(some.ids) / len(others.ids) < 1.25
 
 
 def test_the_same_frames_give_the_same_bits(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,6 +272,8 @@ def test_a_frame_in_which_flow_loses_many_points_is_matched_after_the_answer(
     if fit is not None:
         np.testing.assert_allclose(fit.T_cw, np.eye(4), atol=1e-4)
         assert (flow.over(hurry=False), flow.over(hurry=True)) == (over, False)
+        assert flow.over(hurry=False, busy=True) == over
+        assert flow.left == pytest.approx(found, abs=0.02)
 
 
 def test_no_flow_sets_out_from_a_frame_without_a_pose(views: list[View]) -> None:
