@@ -45,7 +45,7 @@ class SeenFrames:
 
         One that saw little is not kept: what it gives would not do for a pose.
         """
-        if len(fit.matches) < _TURNS * FEW:
+        if len(fit.matches) < (_TURNS if matched else 1) * FEW:
             return None
         number, self._count = self._count, self._count + 1
         if number % self._every:
