@@ -248,6 +248,11 @@ def sample_depth(
     return np.where(refused, np.nan, centre)
 
 
+def bits_of(descriptors: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """[n, 256] 0 or 1, of descriptors [n, 4]."""
+    return np.unpackbits(np.ascontiguousarray(descriptors).view(np.uint8).reshape(-1, 32), axis=1)
+
+
 def hamming(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> NDArray[np.int64]:
     """first, second: [..., 4] descriptors. Returns [...] how many of the 256 bits differ."""
     return np.asarray(np.bitwise_count(first ^ second).sum(axis=-1, dtype=np.int64))

@@ -45,15 +45,14 @@ class SeenFrames:
 
         One that saw little is not kept: what it gives would not do for a pose.
         """
-        if len(fit.matches) < (_TURNS if matched else 1) * FEW:
+        turns = _TURNS if matched else 1
+        if len(fit.matches) < turns * FEW:
             return None
         number, self._count = self._count, self._count + 1
         if number % self._every:
             return None
-        if not matched:
-            return fit.matches
         turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
-        return fit.matches.take((fit.matches.points + turn) % _TURNS == 0)
+        return fit.matches.take((fit.matches.points + turn) % turns == 0)
 
     def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
         """What was chosen of the frame in a row of the log, after those before it, and its corners."""

@@ -156,12 +156,11 @@ class Map:
             if len(changed) == 0:
                 continue
             self.forget(keyframe, changed)
-            taken = np.zeros(self.size + 1, dtype=np.bool_)
-            taken[keyframe.point_ids] = True
             heirs = ids[changed]
-            corner = np.full(self.size + 1, -1)
+            corner = np.full(self.size + 1, -1)  # that an heir gets, the first of several
             corner[heirs[::-1]] = changed[::-1]
-            keep = ~taken[heirs] & (corner[heirs] == changed)
+            corner[keyframe.point_ids] = -1  # it has one
+            keep = corner[heirs] == changed
             self.observe(keyframe, Matches(heirs[keep], changed[keep]))
 
     def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features import LEVELS, Features, hamming
+from cohdc_train.slam.features import LEVELS, Features, bits_of, hamming
 
 _WIDEST = 2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
 
@@ -120,5 +120,4 @@ def match_descriptors(
 
 def _signs(descriptors: NDArray[np.uint64]) -> NDArray[np.float32]:
     """[m, 256] 1 for each set bit of descriptors [m, 4], -1 for each other."""
-    bits = np.unpackbits(np.ascontiguousarray(descriptors).view(np.uint8).reshape(-1, 32), axis=1)
-    return bits.astype(np.float32) * 2 - 1
+    return bits_of(descriptors).astype(np.float32) * 2 - 1

@@ -1,6 +1,5 @@
 """Views at the pace of their stamps: whoever is late finds the newest one, and the others are dropped and counted."""
 
-import math
 import threading
 import time
 from collections.abc import Iterator
@@ -60,7 +59,7 @@ class Paced:
         self._slot: Slot[tuple[View, float]] = Slot()
         self._stop = threading.Event()
         self._reader: threading.Thread | None = None
-        self._due = float("inf")  # when the view was that was given out last
+        self._due = 0.0  # when the view was that was given out last
         self._answered = True
         self._between = float("inf")  # s, from one view to the next
 
@@ -71,8 +70,6 @@ class Paced:
 
     def spent(self) -> float:
         """Share of the time between views that has gone since the latest was due; work beyond 1 holds up the next."""
-        if not math.isfinite(self._between):
-            return 0.0
         return (self._clock.now() - self._due) / max(self._between, 1e-6)
 
     def answered(self) -> None:

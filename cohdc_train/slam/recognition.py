@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.features import bits_of
+
 _TABLES = 8
 _BITS = 16  # of 256, drawn per table: two descriptors meet in a table when all these agree
 
@@ -42,6 +44,5 @@ class Places:
 
     def _hash(self, descriptors: NDArray[np.uint64]) -> NDArray[np.int64]:
         """Sorted hashes without repetition: a pattern that repeats in one picture votes once."""
-        bits = np.unpackbits(np.ascontiguousarray(descriptors).view(np.uint8).reshape(-1, 32), axis=1)
-        keys = bits[:, self._bits].astype(np.int64) @ (1 << np.arange(_BITS))
+        keys = bits_of(descriptors)[:, self._bits].astype(np.int64) @ (1 << np.arange(_BITS))
         return np.unique(keys + (np.arange(_TABLES) << _BITS))

@@ -119,8 +119,9 @@ class Tracker:
             assert self._flow is not None
             if not self._flow.over(spent > _MATCHES_UNTIL, self._mapping.busy):
                 self._motion.found(t, flown.T_cw, flown.information, flown.pull)
-                self._remember(flown, frame, matched=False, hurry=spent > _WORKS_UNTIL)
-                if spent <= _WORKS_UNTIL:
+                hurry = spent > _WORKS_UNTIL
+                self._remember(flown, frame, matched=False, hurry=hurry)
+                if not hurry:
                     self._let(self._mapping.work)
                 return answer.pose(flown, keyframe=False)
         fit, can_join = self._by_map(frame, expected, flown)
