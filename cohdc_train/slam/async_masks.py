@@ -20,8 +20,6 @@ from cohdc_train.slam.source import View
 
 Outline = Callable[[View], tuple[Mask, float]]
 
-_WIDEN = 30.0  # px per second of a mask's age
-
 
 @dataclass(frozen=True)
 class Job:
@@ -41,7 +39,7 @@ class _Done:
 
 
 class CarriedMasks:
-    """The newest mask there is, carried to every frame; the older it is, the wider it is made.
+    """The newest mask there is, carried to every frame, and grown there as much as one in time.
 
     newest: the frame that it was made of, None before the first.
     """
@@ -61,15 +59,13 @@ class CarriedMasks:
         self.newest, self._growth = job, growth
         self._propagation.renew(mask, job.number, job.half)
 
-    def mask(self, view: View) -> tuple[Mask, float]:
-        """[H, W] bool, True = dynamic, for the view that was gone on to, and the mask's age, s."""
-        mask, newest = self._propagation.mask(), self.newest
+    def mask(self, view: View) -> Mask:
+        """[H, W] bool, True = dynamic, for the view that was gone on to."""
+        mask = self._propagation.mask()
         assert mask is not None
-        assert newest is not None
-        age = view.t - newest.view.t
         height, width = view.rgb.shape[:2]
-        grown = grow(mask, (self._growth + _WIDEN * age) / 2).astype(np.uint8)
-        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0), age
+        grown = grow(mask, self._growth / 2).astype(np.uint8)
+        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
 
 
 class AsyncMasks:
@@ -77,7 +73,7 @@ class AsyncMasks:
 
     outline: view -> mask [H, W], True = dynamic, and by how many px it is to grow. It runs in a thread, on the newest
     frame whenever it is free; those that come while it is busy are not kept for it, for a fresher one comes soon. Only
-    the first frame waits for its mask. The older a mask is, the wider it is made. Use inside `with`.
+    the first frame waits for its mask. Use inside `with`.
 
     ages: s, per frame, from the frame its mask was made of; segment_ms: time of each mask in the worker.
     """
@@ -112,9 +108,9 @@ class AsyncMasks:
             self._busy = True
         if self._carried.newest is None:
             self._take(self._results.take())
-        mask, age = self._carried.mask(view)
-        self.ages.append(age)
-        return mask
+        assert self._carried.newest is not None
+        self.ages.append(view.t - self._carried.newest.view.t)
+        return self._carried.mask(view)
 
     def _take(self, done: _Done | None) -> None:
         if done is None:

@@ -13,6 +13,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from cohdc_train.slam.map import Keyframe, Map
 from cohdc_train.slam.optimization import Array, Weighing
@@ -76,5 +77,6 @@ def worker_process() -> Iterator[Executor]:
 
 def _give_way() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
+    threadpool_limits(1, "blas")
     if hasattr(os, "nice"):
         os.nice(NICE)

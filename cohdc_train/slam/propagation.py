@@ -4,7 +4,8 @@ Everything here is at half the images' width and height, where flow costs a quar
 
 1. DIS optical flow says where every pixel of the new frame was in the old one; the mask is fetched from there.
 2. Depth gate: a pixel stays in the mask if it is as deep as the pixel it came from, +-0.3 m.
-3. Cut by depth: within a narrow band about the edge, a pixel belongs to the mask if it is as deep as the mask nearby.
+3. Cut by depth: within a narrow band about the edge, a pixel belongs to the mask if it is as deep as the mask nearby,
+   unless what lies around the mask is as deep as well: then flow alone says.
 """
 
 from collections import deque
@@ -116,14 +117,21 @@ def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
 def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
     """Give the band about a mask's edge to what it is as deep as.
 
-    mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, or without the mask's inside nearby to compare
-    with, stay as they are. Returns [h, w].
+    mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, without the mask's inside nearby to compare
+    with, or where inside and outside are equally deep, as feet and the floor are, stay as they are. Returns [h, w].
     """
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
-    filled = mask.astype(np.uint8)
-    inside = ((cv2.erode(filled, disc) > 0) & (depth > 0)).astype(np.float32)
+    filled, has_depth = mask.astype(np.uint8), depth > 0
+    reached = cv2.dilate(filled, disc) > 0
+    near_inside, as_inside = _as_deep((cv2.erode(filled, disc) > 0) & has_depth, depth)
+    _, as_outside = _as_deep(~reached & has_depth, depth)
+    decided = near_inside & has_depth & ~(as_inside & as_outside)
+    return np.where(decided, as_inside & reached, mask)
+
+
+def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:
+    """Where some of a part of the image [h, w] is nearby, and where depth is its mean there, +-0.3 m."""
     size = (_NEARBY, _NEARBY)
-    share, sums = cv2.boxFilter(inside, -1, size), cv2.boxFilter(inside * depth, -1, size)
-    known = (share > 1e-4) & (depth > 0)
-    alike = np.abs(depth * share - sums) < _GATE * share
-    return np.asarray(np.where(known, alike & (cv2.dilate(filled, disc) > 0), mask))
+    weight = part.astype(np.float32)
+    share, sums = cv2.boxFilter(weight, -1, size), cv2.boxFilter(weight * depth, -1, size)
+    return share > 1e-4, np.abs(depth * share - sums) < _GATE * share

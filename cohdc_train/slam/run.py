@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
@@ -27,8 +28,6 @@ from cohdc_train.slam.viewer import Viewer
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory, read_tum
 
-_FEATURES, _FEATURES_REALTIME = 1500, 1250  # corners per frame
-
 
 def slam(
     *,
@@ -38,7 +37,7 @@ def slam(
     masks: Path | None = None,
     camera: Path | None = None,
     seed: int = 0,
-    features: int | None = None,
+    features: int = 1500,
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
     method: Method = Method(),  # noqa: B008 - the same
     realtime: bool = False,
@@ -62,7 +61,7 @@ def slam(
         masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
         camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
         seed: of the random samples; the same seed gives the same numbers.
-        features: corners per frame; 1500, or 1250 in real time, when not given.
+        features: corners per frame.
         culling: how masks are made.
         method: which parts of the method run.
         realtime: frames come at the pace of their stamps, one that is late is dropped and counted; masks and mapping
@@ -99,7 +98,7 @@ def run_source(
     model: Path | None = None,
     masks: Path | None = None,
     seed: int = 0,
-    features: int | None = None,
+    features: int = 1500,
     culling: Culling | None = None,
     method: Method | None = None,
     realtime: bool = False,
@@ -117,7 +116,6 @@ def run_source(
     DataError when no frame comes.
     """
     _check_options(out, model, masks, seed, features)
-    features = (_FEATURES_REALTIME if realtime else _FEATURES) if features is None else features
     culling, method = culling or Culling(), method or Method()
     truth = None if source.groundtruth is None else read_tum(source.groundtruth)
     maker = _masks(model, masks, source.camera, culling, 1 if realtime else 0)
@@ -171,12 +169,12 @@ def summary(metrics: dict[str, Any]) -> str:
     return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
-def _check_options(out: Path, model: Path | None, masks: Path | None, seed: int, features: int | None) -> None:
+def _check_options(out: Path, model: Path | None, masks: Path | None, seed: int, features: int) -> None:
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
     if seed < 0:
         raise DataError(f"seed is {seed}; it cannot be below 0")
-    if features is not None and features < MIN_START:
+    if features < MIN_START:
         raise DataError(f"features is {features}; a map cannot start with fewer than {MIN_START}")
     check_out(out)
 
@@ -215,11 +213,13 @@ def _masks(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """OpenCV on one thread with a fixed seed: the order of its sums cannot change from run to run."""
+    """OpenCV and linear algebra on one thread, with a fixed seed: the order of sums cannot change from run to run, and
+    no thread of theirs spins where the segmenter works."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
     try:
-        yield
+        with threadpool_limits(1, "blas"):
+            yield
     finally:
         cv2.setNumThreads(before)

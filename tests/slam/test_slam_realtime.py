@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 from plane_world import CAMERA, camera_path, passer_by, render, room, write_sequence
+from threadpoolctl import threadpool_info
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
-from cohdc_train.slam.async_masks import AsyncMasks
+from cohdc_train.slam.async_masks import AsyncMasks, CarriedMasks
 from cohdc_train.slam.background_mapping import worker_process
 from cohdc_train.slam.culling import Mask
 from cohdc_train.slam.method import Method
 from cohdc_train.slam.optimization import exp_se3, to_local
+from cohdc_train.slam.propagation import halve_mask
 from cohdc_train.slam.source import View
 from cohdc_train.slam.tracking import Tracker
 from cohdc_train.slam.window import Solution, close_window, open_window
@@ -87,6 +89,20 @@ def test_a_slow_segmenter_gets_the_newest_frame_and_no_queue() -> None:
         segmenter.wait_for(3)
     assert segmenter.begun == ["0", "1", "8"]
     np.testing.assert_allclose(masks.ages, [*np.arange(8) / 30, 7 / 30], atol=1e-9)
+
+
+def test_a_mask_that_was_carried_on_is_as_wide_as_one_in_time() -> None:
+    rgb, depth, _ = render(room(), camera_path(1)[0])
+    box = np.zeros(depth.shape, dtype=np.bool_)
+    box[40:80, 60:100] = True
+    carried = CarriedMasks()
+    job = carried.advance(view(0, rgb, depth))
+    carried.renew(job, halve_mask(box), 10.0)
+    in_time = carried.mask(job.view)
+    assert in_time.sum() > 1.3 * box.sum(), "it has grown"
+    for index in range(1, 8):
+        job = carried.advance(view(index, rgb, depth))
+    np.testing.assert_array_equal(carried.mask(job.view), in_time)
 
 
 def test_what_the_segmenter_raises_is_raised_to_the_caller() -> None:
@@ -192,6 +208,12 @@ def test_a_terminals_ctrl_c_does_not_end_the_worker() -> None:
             assert executor.submit(pow, 2, 3).result() == 8, "what is left of the map is still adjusted"
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_the_workers_linear_algebra_has_one_thread() -> None:
+    with worker_process() as executor:
+        pools = executor.submit(threadpool_info).result()
+    assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} == {1}
 
 
 def test_the_command_in_real_time_accounts_for_every_frame(tmp_path: Path) -> None:

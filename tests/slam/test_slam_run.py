@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 import yaml
 from plane_world import CAMERA_YAML, write_sequence
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
+from cohdc_train.slam.camera import choose_camera
 from cohdc_train.slam.culling import Culling, ModelMasks
 from cohdc_train.slam.method import Method
-from cohdc_train.slam.run import slam
-from cohdc_train.slam.source import View
+from cohdc_train.slam.run import run_source, slam
+from cohdc_train.slam.source import Recorded, View
 from cohdc_train.trajectory import read_tum
 
 SIX = {"rmse", "mean", "median", "std", "min", "max"}
@@ -203,6 +205,20 @@ def test_a_doubtful_contour_grows_more_unless_its_cut_has_seen_to_that(
     masks = ModelMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
     assert masks(view)[120].sum() == 160 + px
     assert masks.outline(view)[1] == px
+
+
+def threads() -> set[int]:
+    """Of the libraries that do linear algebra."""
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_linear_algebra_has_one_thread_while_it_runs(sequence: Path, tmp_path: Path) -> None:
+    seen = set()
+    with threadpool_limits(2, "blas"):
+        source = Recorded(sequence, choose_camera(sequence, None)[0])
+        run_source(source, out=tmp_path / "out", features=300, on_pose=lambda pose: seen.update(threads()))
+        assert seen == {1}
+        assert threads() == {2}, "they are given back"
 
 
 def test_torch_is_never_imported() -> None:
