@@ -1,0 +1,49 @@
+"""tools/carried_masks: how well masks are carried on, measured."""
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from plane_world import write_sequence
+from tool_loader import load_tool
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    return load_tool("carried_masks")
+
+
+def run(tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: int) -> None:
+    write_sequence(root / "plane", frames, with_passer_by=True)
+    words = ["--sequences", str(root / "plane"), "--out", str(root / "out"), "--steps", "1", "4"]
+    monkeypatch.setattr(sys, "argv", ["carried_masks", *words])
+    tool.main()
+
+
+def test_it_says_how_much_of_the_people_and_of_the_rest_is_covered(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tool, monkeypatch, tmp_path, 12)
+    one, four = json.loads((tmp_path / "out" / "carried_masks.json").read_text())
+    assert (one["frames"], four["frames"]) == (1, 4)
+    for row in (one, four):
+        assert row["covered"] > 0.97
+        assert 0 <= row["others"] < 0.01
+    assert f"| plane | 4 | {four['iou']:.3f} |" in (tmp_path / "out" / "carried_masks.md").read_text()
+
+
+def test_likeness_counts_pixels(tool: ModuleType) -> None:
+    truth, mask = np.zeros((2, 10, 10), dtype=np.bool_)
+    truth[:4, :5] = True
+    mask[2:6, :5] = True
+    assert tool.likeness(mask, truth) == (10 / 30, 10 / 20, 10 / 80)
+
+
+def test_a_sequence_too_short_for_the_steps_is_named(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit, match="plane: of 4 frames none"):
+        run(tool, monkeypatch, tmp_path, 4)
