@@ -9,7 +9,10 @@ from typing import NamedTuple
 
 from cohdc_train.errors import CohdcError
 
-BASE = ("numpy", "opencv-python-headless", "onnxruntime", "jsonargparse", "pyyaml", "scipy", "matplotlib")
+BASE = (
+    *("numpy", "opencv-python-headless", "onnxruntime", "jsonargparse", "pyyaml", "scipy", "threadpoolctl"),
+    "matplotlib",
+)
 TRAIN = (
     *("torch", "torchvision", "lightning", "pycocotools", "faster-coco-eval", "onnx", "onnxscript", "onnxslim"),
     *("kornia", "rich", "tensorboard", "embreex", "shapely", "pillow"),

@@ -1,5 +1,7 @@
 """`cohdc env` finds what cannot work, by planted packages in a process of their own."""
 
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,11 @@ from cohdc_train.env import BASE, TRAIN, Fault, env, inspect
 from cohdc_train.errors import CohdcError
 
 HEALTHY: dict[str, str | None] = {**dict.fromkeys(BASE, "1.0"), **dict.fromkeys(TRAIN)}
+
+
+def test_it_knows_of_every_package_that_is_needed() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert [re.split(r"[\[><=!]", needed)[0] for needed in project["dependencies"]] == list(BASE)
 
 
 def plant(folder: Path, monkeypatch: pytest.MonkeyPatch, **modules: str) -> None:

@@ -39,7 +39,7 @@ class _Done:
 
 
 class CarriedMasks:
-    """The newest mask there is, carried to every frame, and grown there as much as one in time.
+    """The newest mask there is, carried to every frame, and grown there by what its outline asked for.
 
     newest: the frame that it was made of, None before the first.
     """

@@ -68,14 +68,14 @@ class BackgroundMapper:
 
 @contextmanager
 def worker_process() -> Iterator[Executor]:
-    """One process, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
+    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as executor:
-        executor.submit(_give_way).result()
+        executor.submit(_begin).result()
         yield executor
 
 
-def _give_way() -> None:
+def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
     threadpool_limits(1, "blas")
     if hasattr(os, "nice"):

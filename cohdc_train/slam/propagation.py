@@ -122,11 +122,11 @@ def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
     """
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
     filled, has_depth = mask.astype(np.uint8), depth > 0
-    reached = cv2.dilate(filled, disc) > 0
-    near_inside, as_inside = _as_deep((cv2.erode(filled, disc) > 0) & has_depth, depth)
+    reached, core = cv2.dilate(filled, disc) > 0, cv2.erode(filled, disc) > 0
+    near_inside, as_inside = _as_deep(core & has_depth, depth)
     _, as_outside = _as_deep(~reached & has_depth, depth)
-    decided = near_inside & has_depth & ~(as_inside & as_outside)
-    return np.where(decided, as_inside & reached, mask)
+    decided = near_inside & has_depth & reached & ~core & ~(as_inside & as_outside)
+    return np.where(decided, as_inside, mask)
 
 
 def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:

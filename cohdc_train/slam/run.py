@@ -1,14 +1,11 @@
 """`cohdc slam`: an RGB-D sequence in, a trajectory and its scores out."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import cv2
-from threadpoolctl import threadpool_limits
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
@@ -17,6 +14,7 @@ from cohdc_train.slam.culling import Culling, FolderMasks, ModelMasks, no_masks
 from cohdc_train.slam.live import Followed, stopped_by_ctrl_c
 from cohdc_train.slam.map_files import MapFiles
 from cohdc_train.slam.method import Method
+from cohdc_train.slam.one_thread import one_thread
 from cohdc_train.slam.playback import play
 from cohdc_train.slam.pose import OnPose
 from cohdc_train.slam.realtime import workers
@@ -109,7 +107,8 @@ def run_source(
     on_pose: OnPose | None = None,
     origin: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """`slam` of any source of views, a camera of one's own for instance; the same files, metrics and errors.
+    """`slam` of any source of views, a camera of one's own for instance; the same files, metrics and errors. One run at
+    a time in a process (`one_thread`).
 
     on_pose: called with every frame's pose as soon as it is known; watchers: when what the frame adds to the map has
     been done as well, in real time up to a frame's time later; origin: words about the source for config.yaml. Raises
@@ -123,7 +122,7 @@ def run_source(
     config: dict[str, Any] = {key: str(v) if isinstance(v, Path) else v for key, v in options.items()}
     config |= {"culling": asdict(culling), "method": asdict(method), "camera": source.camera.as_dict()}
     config |= {**(origin or {}), "version": __version__}
-    with _one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+    with one_thread(), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         part = Path(folder)
         with ExitStack() as stack:
             beside = stack.enter_context(workers(source, maker)) if realtime else None
@@ -209,17 +208,3 @@ def _masks(
     from cohdc_train.segmenter import Segmenter
 
     return ModelMasks(Segmenter(model, threads), culling)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """OpenCV and linear algebra on one thread, with a fixed seed: the order of sums cannot change from run to run, and
-    no thread of theirs spins where the segmenter works."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    cv2.setRNGSeed(0)
-    try:
-        with threadpool_limits(1, "blas"):
-            yield
-    finally:
-        cv2.setNumThreads(before)

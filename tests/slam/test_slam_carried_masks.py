@@ -16,9 +16,9 @@ def tool() -> ModuleType:
     return load_tool("carried_masks")
 
 
-def run(tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: int) -> None:
+def run(tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: int, *steps: str) -> None:
     write_sequence(root / "plane", frames, with_passer_by=True)
-    words = ["--sequences", str(root / "plane"), "--out", str(root / "out"), "--steps", "1", "4"]
+    words = ["--sequences", str(root / "plane"), "--out", str(root / "out"), "--steps", *steps]
     monkeypatch.setattr(sys, "argv", ["carried_masks", *words])
     tool.main()
 
@@ -26,13 +26,13 @@ def run(tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: i
 def test_it_says_how_much_of_the_people_and_of_the_rest_is_covered(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(tool, monkeypatch, tmp_path, 12)
-    one, four = json.loads((tmp_path / "out" / "carried_masks.json").read_text())
-    assert (one["frames"], four["frames"]) == (1, 4)
-    for row in (one, four):
-        assert row["covered"] > 0.97
+    run(tool, monkeypatch, tmp_path, 24, "1", "10")
+    one, ten = json.loads((tmp_path / "out" / "carried_masks.json").read_text())
+    assert (one["frames"], ten["frames"]) == (1, 10)
+    for row in (one, ten):
+        assert row["covered"] > 0.97, "left where it was, it would cover .85"
         assert 0 <= row["others"] < 0.01
-    assert f"| plane | 4 | {four['iou']:.3f} |" in (tmp_path / "out" / "carried_masks.md").read_text()
+    assert f"| plane | 10 | {ten['iou']:.3f} |" in (tmp_path / "out" / "carried_masks.md").read_text()
 
 
 def test_likeness_counts_pixels(tool: ModuleType) -> None:
@@ -45,5 +45,10 @@ def test_likeness_counts_pixels(tool: ModuleType) -> None:
 def test_a_sequence_too_short_for_the_steps_is_named(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(SystemExit, match="plane: of 4 frames none"):
-        run(tool, monkeypatch, tmp_path, 4)
+    with pytest.raises(SystemExit, match="plane: of 4 frames none with anybody in it has 4 after it"):
+        run(tool, monkeypatch, tmp_path, 4, "1", "4")
+
+
+def test_steps_begin_at_one(tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit, match="1 or more, not 0"):
+        run(tool, monkeypatch, tmp_path, 4, "0", "4")

@@ -122,3 +122,12 @@ def test_feet_do_not_run_out_over_the_floor_they_stand_on() -> None:
         mask = cut_by_depth(mask, depth)
     assert not (mask & ~truth)[83:].any(), "but for the corners beside the feet, where wall and floor are mixed"
     assert iou(mask, truth) > 0.97
+
+
+def test_only_the_edge_is_decided_by_depth() -> None:
+    depth = np.full((120, 160), PERSON, dtype=np.float32)
+    depth[30:90, 60:75] = PERSON - 0.8  # an arm held out
+    np.testing.assert_array_equal(cut_by_depth(np.ones_like(depth, dtype=np.bool_), depth), True)
+    mask = np.zeros_like(depth, dtype=np.bool_)
+    mask[20:100, 40:120] = True
+    assert cut_by_depth(mask, depth)[25:95, 45:115].all()

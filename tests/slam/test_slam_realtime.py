@@ -210,7 +210,8 @@ def test_a_terminals_ctrl_c_does_not_end_the_worker() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_the_workers_linear_algebra_has_one_thread() -> None:
+def test_the_workers_linear_algebra_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     with worker_process() as executor:
         pools = executor.submit(threadpool_info).result()
     assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} == {1}
