@@ -26,6 +26,8 @@ from cohdc_train.slam.viewer import Viewer
 from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory, read_tum
 
+_FEATURES = 1500  # corners per frame
+
 
 def slam(
     *,
@@ -35,7 +37,7 @@ def slam(
     masks: Path | None = None,
     camera: Path | None = None,
     seed: int = 0,
-    features: int = 1500,
+    features: int = _FEATURES,
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
     method: Method = Method(),  # noqa: B008 - the same
     realtime: bool = False,
@@ -96,7 +98,7 @@ def run_source(
     model: Path | None = None,
     masks: Path | None = None,
     seed: int = 0,
-    features: int = 1500,
+    features: int = _FEATURES,
     culling: Culling | None = None,
     method: Method | None = None,
     realtime: bool = False,
