@@ -65,8 +65,7 @@ def trained_entry(
     row: a name of ROWS or the YAML file of another network. Raises CohdcError when it is neither.
     """
     own = [f"--config={row_config(row)}", f"--seed_everything={seed}"]
-    if weights is not None:
-        own.append(f"--model.network.weights={weights}")
+    own.append("--pretrained=none" if weights is None else f"--model.network.weights={weights}")
     trained = train(folder, [data.resolve()], (*options, *own), threads)
     return _exported(Path(row).stem, seed, trained, data, folder, threads, int8)
 

@@ -38,7 +38,7 @@ def train(folder: Path, data: Sequence[Path], options: Sequence[str], threads: i
     kept.unlink(missing_ok=True)
     start = time.monotonic()
     roots = f"[{','.join(str(root) for root in data)}]"
-    fixed = (f"--data.root={roots}", f"--out={folder}", "--data.workers=0", "--trainer.check_val_every_n_epoch=1000000")
+    fixed = (f"--data.root={roots}", f"--out={folder}", "--data.workers=0", "--trainer.limit_val_batches=0")
     quiet = ("--pictures=false", "--trainer.enable_progress_bar=false")
     call(folder / "log.txt", "fit", *fixed, *quiet, *options, threads=threads)
     seconds = time.monotonic() - start

@@ -72,6 +72,10 @@ class CocoSplit:
         chosen = sorted(np.random.default_rng(0).permutation(len(self.images))[:count])
         return replace(self, images=tuple(self.images[i] for i in chosen))
 
+    def with_objects(self) -> "CocoSplit":
+        """Return the split without images that have no object."""
+        return replace(self, images=tuple(image for image in self.images if any(not o.crowd for o in image.objects)))
+
     def losses(self) -> str:
         """What reading left out or cut, counted, in one line; empty when nothing was."""
         parts = [f"{number} annotations dropped ({reason})" for reason, number in sorted(self.dropped.items())]

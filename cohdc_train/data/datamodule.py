@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from cohdc_train.data import image_files
 from cohdc_train.data.annotations import CocoImage, read_image
+from cohdc_train.data.canvas import choose_canvas
 from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder, read_split
 from cohdc_train.data.layout import CocoPaths, find_split
 from cohdc_train.data.train_set import CocoTrainSet, Target
@@ -79,13 +80,16 @@ class CocoDataModule(pl.LightningDataModule):
     Args:
         root: the folder, or several.
         classes: use these classes only; None uses all of them.
-        canvas: (height, width) in px every training image is fitted into; the network takes it over.
+        canvas: (height, width) in px every training image is fitted into; the network takes it over. "auto" chooses it
+            from the images, at most 480 x 640 px in area.
         batch_size: images per batch and device; `cohdc fit` also takes "auto", the most that memory allows.
         workers: processes that read images; 0 reads them in the trainer's own.
         augment: what training images go through.
         mini_mask: (height, width) in cells at which each training mask is kept, on its box: less memory for many
             objects, softer contours for large ones. None keeps whole masks.
         subset: how many images of each split to use.
+        overfit: train on so many training images, without augmentation, and validate on the same ones: a check that
+            the labels can be learned at all. 0 is a normal training.
         cutouts: folders of the same classes whose training objects are pasted into the pictures of `root`, but whose
             pictures are not trained on; with `augment.copy_paste`.
         paths: annotation files and image folders, where the layout is an unusual one.
@@ -98,24 +102,28 @@ class CocoDataModule(pl.LightningDataModule):
         self,
         root: list[Path] | Path | None = None,
         classes: list[str] | None = None,
-        canvas: tuple[int, int] = (800, 1024),
+        canvas: tuple[int, int] | Literal["auto"] = "auto",
         batch_size: int | Literal["auto"] = 2,
         workers: int = 1,
         augment: Augmentation = _AUGMENTATION,
         mini_mask: tuple[int, int] | None = None,
         subset: Subset = _EVERYTHING,
+        overfit: int = 0,
         cutouts: list[Path] | None = None,
         paths: CocoPaths | None = None,
     ) -> None:
         super().__init__()
         self.roots = [Path(r) for r in root] if isinstance(root, list) else [] if root is None else [Path(root)]
         self.classes = classes
-        self.canvas = canvas
+        self._canvas = canvas
         self.batch_size = batch_size
         self.workers = workers
         self.augment = augment
         self.mini_mask = mini_mask
         self.subset = subset
+        self.overfit = overfit
+        if overfit:
+            self.augment = augment = Augmentation(flip=0.0, scale_jitter=(1.0, 1.0), photometric=False)
         self.cutouts = cutouts or []
         if self.cutouts and not augment.copy_paste:
             raise DataError("data.cutouts are pasted nowhere: give data.augment.copy_paste, a probability")
@@ -130,7 +138,18 @@ class CocoDataModule(pl.LightningDataModule):
             whole = read_folder(self.roots, self.classes, self.paths)
             train = tuple(split.subset(self.subset.train) for split in whole.train)
             self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
+            if self.overfit:
+                same = train[0].with_objects().subset(self.overfit)
+                self._folder = CocoFolder((same,), same)
         return self._folder
+
+    @property
+    def canvas(self) -> tuple[int, int]:
+        """(height, width) in px that training images are fitted into."""
+        if self._canvas == "auto":
+            images = _images(self.folder.train)
+            self._canvas = choose_canvas([(image.height, image.width) for image in images])
+        return self._canvas
 
     @cached_property
     def givers(self) -> tuple[CocoSplit, ...]:

@@ -4,7 +4,7 @@ Torchvision's detection parts wherever they fit, under torchvision's names, so t
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any, Literal
 
@@ -41,11 +41,12 @@ class NetworkConfig:
         width: channels of the backbone as a share of ResNet's.
         rates: dilation patterns of the four stages.
         weights: torchvision name or local path of ImageNet weights for the backbone; None trains from scratch.
-        norm: of the backbone, and "batch" of the pyramid too: "batch" trains BatchNorm, "frozen" keeps the weights'
-            statistics.
+        norm: of the backbone, and "batch" of the pyramid too: "batch" trains BatchNorm, "frozen" keeps the statistics
+            of the initial weights, "auto" is "frozen" with initial weights and "batch" without.
         head_norm: "batch" trains BatchNorm in the pyramid and the mask head whatever the backbone has; exported, it
             costs nothing.
-        frozen_stages: how many of the stem and the four stages are not trained.
+        frozen_stages: how many of the stem and the four stages are not trained; None is 2 with initial weights, as in
+            torchvision, and 0 without.
         canvas: (height, width) in px every image is fitted into.
         finest_stride: of the pyramid: 4, or 8 without the level that costs most and sees the smallest objects.
         anchor_scales: side of the anchors in px, one per pyramid level from the finest; one more adds the pool level.
@@ -70,9 +71,9 @@ class NetworkConfig:
     width: float = 1.0
     rates: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3))
     weights: str | None = None
-    norm: Norm = "batch"
+    norm: Norm | Literal["auto"] = "auto"
     head_norm: Literal["none", "batch"] = "none"
-    frozen_stages: int = 0
+    frozen_stages: int | None = None
     canvas: tuple[int, int] = (800, 1024)
     finest_stride: Literal[4, 8] = 4
     anchor_scales: tuple[int, ...] = (32, 64, 128, 256)
@@ -92,12 +93,21 @@ class NetworkConfig:
         levels, scales = len(self.roi_strides()), len(self.anchor_scales)
         if scales not in (levels, levels + 1):
             raise ValueError(f"anchor_scales {self.anchor_scales}: {scales} scales for {levels} or {levels + 1} levels")
-        if not 0 <= self.frozen_stages <= 5:
+        if self.frozen_stages is not None and not 0 <= self.frozen_stages <= 5:
             raise ValueError(f"frozen_stages {self.frozen_stages}: a ResNet has a stem and 4 stages")
         if self.mask_cut == "quality" and (self.cqe == "off" or self.cqe_target != "iou"):
             raise ValueError("mask_cut quality needs a CQE head that estimates the mask's IoU")
         if self.weights is not None and self.width != 1.0:
             raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
+
+    def resolved(self, pretrained: bool) -> "NetworkConfig":
+        """Return a copy in which norm and frozen_stages are decided.
+
+        pretrained: whether training starts from trained weights of the backbone, of this config or elsewhere.
+        """
+        norm: Norm = ("frozen" if pretrained else "batch") if self.norm == "auto" else self.norm
+        frozen = (2 if pretrained else 0) if self.frozen_stages is None else self.frozen_stages
+        return replace(self, norm=norm, frozen_stages=frozen)
 
     def roi_strides(self) -> list[int]:
         """Strides of the pyramid's levels, without the pool level."""
@@ -113,7 +123,9 @@ class Backbone(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        shape = (config.width, config.rates, config.norm, config.frozen_stages)
+        config = config.resolved(pretrained=config.weights is not None)
+        body_norm: Norm = "frozen" if config.norm == "frozen" else "batch"
+        shape = (config.width, config.rates, body_norm, config.frozen_stages or 0)
         self.body: HDCResNet | MobileNetV1 | MobileNetV2
         if config.backbone == "resnet":
             self.body = HDCResNet(config.depth, *shape)
@@ -150,6 +162,7 @@ class MaskRCNN(nn.Module):
 
     def __init__(self, num_classes: int, config: NetworkConfig) -> None:
         super().__init__()
+        config = config.resolved(pretrained=config.weights is not None)
         self.config = config
         self.num_classes = num_classes
         channels = config.fpn_channels
@@ -229,7 +242,10 @@ class MaskRCNN(nn.Module):
         pooled = heads.mask_roi_pool(features, boxes, sizes)
         logits = heads.mask_predictor(heads.mask_head(pooled)).float()
         # The losses turn masks into float32: only those of the sampled objects, however many the image has.
-        joined: Target = {key: torch.cat([t[key] for t in targets]) for key in ("masks", "frames") if key in targets[0]}
+        keys = [key for key in ("masks", "frames") if key in targets[0]]
+        with torch.autocast(logits.device.type, enabled=False):
+            # Autocast to bfloat16 on a CPU cannot concatenate the float16 of mini-masks.
+            joined: Target = {key: torch.cat([t[key] for t in targets]) for key in keys}
         before = accumulate((len(t["boxes"]) for t in targets[:-1]), initial=0)
         every = torch.cat([m + n for m, n in zip(matches, before, strict=True)])
         used, objects = torch.unique(every, return_inverse=True)

@@ -1,5 +1,6 @@
 """What every backbone here is: a stem and four stages of strides 4, 8, 16, 32, whose 3x3 convolutions are dilated."""
 
+import pickle
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,12 +21,13 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..
 
 
 class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not typed
-    """Torchvision's, which in mixed precision turns every half-precision map into float32 and leaves it so."""
+    """BatchNorm whose statistics, scale and shift are constants.
+
+    Torchvision's makes two passes over the map, and turns it into float32 in mixed precision; this makes one.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
-        if x.dtype == self.weight.dtype:
-            out: Tensor = super().forward(x)
-            return out
+        """x: [B, C, H, W]. Returns the normalized map, same shape and dtype."""
         return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
 
 
@@ -141,19 +143,37 @@ def load_weights(backbone: StagedBackbone, source: str, state: dict[str, Tensor]
 
 
 def read_weights(weights: str, model: str | None) -> dict[str, Tensor]:
-    """A state dict: a file that `torch.save` wrote, or torchvision's weights of that name for its model.
+    """Read a state dict: a file that `torch.save` wrote, or torchvision's weights of that name for its model.
 
-    Raises FileNotFoundError when there is no such file and no such name; model is None where nothing is published.
+    Raises FileNotFoundError when there is no such file and no such name, or the download fails; model is None where
+    nothing is published. Raises ValueError when the file holds no state dict.
     """
     if Path(weights).is_file():
-        stored: dict[str, Tensor] = torch.load(weights, map_location="cpu", weights_only=True)
-        return stored
+        return _read_state_dict(Path(weights))
     published = {} if model is None else get_model_weights(model).__members__
     if weights in published:
-        fetched: dict[str, Tensor] = published[weights].get_state_dict(progress=True)
+        try:
+            fetched: dict[str, Tensor] = published[weights].get_state_dict(progress=True)
+        except (OSError, RuntimeError) as error:  # no network, or a file that is not the published one
+            reason = " ".join(str(error).split())
+            raise FileNotFoundError(
+                f"{weights} of {model}: the download of {published[weights].url} failed ({reason}); give a local file "
+                "with --pretrained FILE.pth, or start from random weights with --pretrained none"
+            ) from error
         return fetched
     names = f"torchvision's {model} weights are {', '.join(published)}" if model else "torchvision publishes none"
     raise FileNotFoundError(f"{weights}: no such file, and {names}")
+
+
+def _read_state_dict(path: Path) -> dict[str, Tensor]:
+    """Read the tensors of a file that `torch.save` wrote. Raises ValueError naming the file when it is none."""
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{path}: not a file of torch weights: {str(error).partition(chr(10))[0]}") from error
+    if not isinstance(stored, dict) or not all(torch.is_tensor(value) for value in stored.values()):
+        raise ValueError(f"{path}: not a state dict of a backbone, which holds tensors only")
+    return dict(stored)
 
 
 def _convolutions(stage: Sequence[nn.Module]) -> list[nn.Conv2d]:

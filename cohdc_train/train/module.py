@@ -1,7 +1,6 @@
 """Lightning around the network: losses, optimizer and schedule, validation scores, checkpoints."""
 
 import dataclasses
-import math
 import pickle
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,9 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
 from cohdc_train.train.exported import load_exported, read_exported
 from cohdc_train.train.metrics import Results, SegmentationMetrics
-from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, time_spent
+from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, training_progress
 
 _OF_CLASSES = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.", "cqe.quality.")
-_ENDLESS = 2**31  # steps of a training that only time ends
 MIN_CANVAS = 32  # px: one cell of the coarsest level that RoIs are pooled from
 _NETWORK = NetworkConfig()
 _OPTIMIZER = OptimizerConfig()
@@ -43,7 +41,8 @@ class MaskRCNNModule(pl.LightningModule):
     ) -> None:
         super().__init__()
         self.class_names = list(class_names)
-        self.network_config = _rebuild(NetworkConfig, network)
+        config: NetworkConfig = _rebuild(NetworkConfig, network)
+        self.network_config = config.resolved(pretrained=config.weights is not None)
         self.optimizer_config = _rebuild(OptimizerConfig, optimizer)
         self.rescore = rescore
         self.min_quality = 0.0  # of the detections that validation scores
@@ -60,6 +59,7 @@ class MaskRCNNModule(pl.LightningModule):
         self._metrics: SegmentationMetrics | None = None
         self._fused: list[MaskRCNN] = []  # while validation lasts; in a list it is no part of the module
         self.results: Results | None = None  # of the last validation
+        self.validated_step = -1  # optimizer steps made before it
 
     @classmethod
     def load(cls, path: Path, canvas: tuple[int, int] | None = None) -> "MaskRCNNModule":
@@ -112,7 +112,7 @@ class MaskRCNNModule(pl.LightningModule):
         except FileNotFoundError as error:
             raise CohdcError(f"{path}: no such file") from error
         except ValueError as error:
-            raise CohdcError(f"{path}: {error}") from error
+            raise CohdcError(f"{path}: {error}; --pretrained imagenet or none starts without it") from error
         return other
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
@@ -148,18 +148,20 @@ class MaskRCNNModule(pl.LightningModule):
         """Log the scores under `val/`."""
         assert self._metrics is not None
         self.results = self._metrics.results()
+        if not self.trainer.sanity_checking:
+            self.validated_step = self.trainer.global_step
         for name, value in self.results.scores.items():
             self.log(f"val/{name}", value, prog_bar=name == "segm_AP50", sync_dist=True)
         self._fused = []
 
     def configure_optimizers(self) -> Any:
         """Optimizer over what is trained, and its schedule over the trainer's steps."""
-        total, spent = self.trainer.estimated_stepping_batches, time_spent(self.trainer)
-        if math.isinf(total) and spent is None:
-            raise CohdcError("the schedule needs an end: give trainer.max_epochs, max_steps or max_time")
+        progress = training_progress(self.trainer, self.trainer.estimated_stepping_batches)
+        if progress is None:
+            raise CohdcError("the schedule needs an end: give --epochs, --minutes or --trainer.max_steps")
         # Fused saves a tenth of a step on a CPU; in mixed precision Lightning cannot clip its gradients.
         optimizer, schedule = build_optimizer(
-            self.optimizer_config, self.network, int(min(total, _ENDLESS)), self.trainer.precision == "32-true", spent
+            self.optimizer_config, self.network, progress, fused=self.trainer.precision == "32-true"
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 

@@ -1,4 +1,4 @@
-"""The optimizer, its schedule, and how much of it the backbone gets."""
+"""Optimizer, learning-rate schedule, and the share of it that the backbone gets."""
 
 import math
 from collections.abc import Callable
@@ -14,30 +14,34 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cohdc_train.models import MaskRCNN
 
-Spent = Callable[[int], float]  # step -> share of the training's time that is over
+Progress = Callable[[int], float]  # step -> share of the training budget that is used, 0..1
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """The optimizer and its learning rate, per step: a linear warm-up, then half a cosine until the last step, or until
-    the training's time is up where that comes first.
+    """Optimizer and learning rate: linear warm-up times half a cosine over the training budget.
+
+    The budget is what ends the training: epochs, steps or minutes. The rate is a continuous function of the share of
+    it that is used, so it neither jumps at the end of the warm-up nor when a clock takes over from the steps.
 
     Attributes:
         name: "sgd" or "adamw".
-        lr: learning rate behind the warm-up.
+        lr: peak learning rate.
         weight_decay: of weights; biases and norms have none.
         momentum: of SGD.
-        warmup_steps: steps from 0 to lr, at most a tenth of the training.
-        final_fraction: share of lr left at the last step; 1 keeps it constant.
-        backbone_lr: the backbone's learning rate as a share of lr.
-        frozen_steps: steps at the beginning in which the backbone rests, while what is new around it settles.
+        warmup_ratio: share of the budget over which the rate rises from 0.
+        warmup_steps: length of the warm-up in steps instead; None takes warmup_ratio.
+        final_fraction: share of lr left at the end; 1 keeps it constant after the warm-up.
+        backbone_lr: learning rate of the backbone as a share of lr.
+        frozen_steps: steps at the beginning in which the backbone is not trained.
     """
 
     name: Literal["sgd", "adamw"] = "adamw"
-    lr: float = 2e-4
+    lr: float = 8e-4
     weight_decay: float = 0.05
     momentum: float = 0.9
-    warmup_steps: int = 200
+    warmup_ratio: float = 0.05
+    warmup_steps: int | None = None
     final_fraction: float = 0.01
     backbone_lr: float = 1.0
     frozen_steps: int = 0
@@ -45,62 +49,91 @@ class OptimizerConfig:
     def __post_init__(self) -> None:
         if self.lr <= 0 or not 0 <= self.final_fraction <= 1:
             raise ValueError(f"lr {self.lr} must be above 0 and final_fraction {self.final_fraction} in 0..1")
+        if not 0 <= self.warmup_ratio < 1 or (self.warmup_steps or 0) < 0:
+            raise ValueError(
+                f"warmup_ratio {self.warmup_ratio} must be in 0..1 and warmup_steps {self.warmup_steps} not negative"
+            )
         if self.backbone_lr < 0 or self.frozen_steps < 0:
             raise ValueError(f"backbone_lr {self.backbone_lr} or frozen_steps {self.frozen_steps} is negative")
 
-    def factor(self, step: int, total: int, spent: float = 0.0) -> float:
-        """Share of lr at a step of `total`, when a share `spent` of the training's time is over."""
-        warmup = min(self.warmup_steps, total // 10)
-        if step < warmup:
-            return (step + 1) / (warmup + 1)
-        done = min(1.0, max(spent, (step - warmup) / max(1, total - warmup)))
-        return self.final_fraction + (1 - self.final_fraction) * 0.5 * (1 + math.cos(math.pi * done))
+    def factor(self, step: int, progress: float) -> float:
+        """Return the share of lr at a step.
+
+        Args:
+            step: optimizer steps already made.
+            progress: share of the budget that is used, 0..1.
+        """
+        progress = min(1.0, max(0.0, progress))
+        cosine = 0.5 * (1 + math.cos(math.pi * progress))
+        return self._warmup(step, progress) * (self.final_fraction + (1 - self.final_fraction) * cosine)
+
+    def _warmup(self, step: int, progress: float) -> float:
+        """Return the share of the warm-up that is over, 0..1; never 0, so that the first step trains too."""
+        if self.warmup_steps is not None:
+            return min(1.0, (step + 1) / (self.warmup_steps + 1))
+        if self.warmup_ratio == 0:
+            return 1.0
+        return min(1.0, max(progress / self.warmup_ratio, 1e-3))
 
 
 def build_optimizer(
-    config: OptimizerConfig, network: MaskRCNN, total: int, fused: bool, spent: Spent | None = None
+    config: OptimizerConfig, network: MaskRCNN, progress: Progress, fused: bool
 ) -> tuple[torch.optim.Optimizer, LambdaLR]:
-    """Optimizer over what is trained of a network, and its schedule over `total` steps.
+    """Build the optimizer of a network's trainable parameters, and its schedule.
 
-    spent: share of the training's time that is over at a step, where it has an end in time.
-    Weights and the rest (biases, norms) of the backbone and of what stands around it are four groups. A resting
-    backbone's learning rate is 0: its gradients are still made, so that every rank of a distributed run has them.
+    Weights and the rest (biases, norms) of the backbone and of what surrounds it are four groups. The learning rate of
+    a backbone that is not trained yet is 0: its gradients exist, so that every rank of a distributed run has them.
     """
     groups: list[dict[str, object]] = []
-    shares: list[tuple[float, int]] = []
-    for share, rest, parameters in (
-        (1.0, 0, [p for name, p in network.named_parameters() if not name.startswith("backbone.body.")]),
-        (config.backbone_lr, config.frozen_steps, list(network.backbone.body.parameters())),
+    factors: list[Callable[[int], float]] = []
+    for name, share, frozen_steps, parameters in (
+        ("heads", 1.0, 0, [p for name, p in network.named_parameters() if not name.startswith("backbone.body.")]),
+        ("backbone", config.backbone_lr, config.frozen_steps, list(network.backbone.body.parameters())),
     ):
         for weights in (True, False):
             chosen: list[Tensor] = [p for p in parameters if p.requires_grad and (p.ndim > 1) == weights]
             if chosen:
-                groups.append({"params": chosen, "weight_decay": config.weight_decay if weights else 0.0})
-                shares.append((share, rest))
+                decay = config.weight_decay if weights else 0.0
+                groups.append(
+                    {"params": chosen, "weight_decay": decay, "name": f"{name}_{'weights' if weights else 'biases'}"}
+                )
+                factors.append(_group_factor(config, progress, share, frozen_steps))
     optimizer: torch.optim.Optimizer
     if config.name == "sgd":
         optimizer = torch.optim.SGD(groups, lr=config.lr, momentum=config.momentum)
     else:
         optimizer = torch.optim.AdamW(groups, lr=config.lr, fused=fused)
-    return optimizer, LambdaLR(optimizer, [_factor(config, total, spent, *share) for share in shares])
+    return optimizer, LambdaLR(optimizer, factors)
 
 
-def _factor(
-    config: OptimizerConfig, total: int, spent: Spent | None, share: float, rest: int
+def _group_factor(
+    config: OptimizerConfig, progress: Progress, share: float, frozen_steps: int
 ) -> Callable[[int], float]:
-    """Share of lr of a group at a step: `share` of the schedule, nothing in the first `rest` steps."""
-    return lambda step: share * config.factor(step, total, spent(step) if spent else 0.0) if step >= rest else 0.0
+    """Return a function of the step: the share of lr that a parameter group gets."""
+
+    def factor(step: int) -> float:
+        return share * config.factor(step, progress(step)) if step >= frozen_steps else 0.0
+
+    return factor
 
 
-def time_spent(trainer: Trainer) -> Spent | None:
-    """Share of `max_time` that is over at a step, the same on all devices; None for a trainer without one."""
-    timers = [callback for callback in trainer.callbacks if isinstance(callback, Timer)]  # type: ignore[attr-defined]
-    if not timers or (whole := timers[0].time_remaining()) is None:
-        return None
-    whole += timers[0].time_elapsed()
+def training_progress(trainer: Trainer, total_steps: float) -> Progress | None:
+    """Return the share of the budget that is used at a step: of the steps or of `max_time`, whichever is further.
 
-    @lru_cache(maxsize=1)  # the groups ask in turn
-    def spent(step: int) -> float:
-        return min(1.0, float(trainer.strategy.broadcast(timers[0].time_elapsed() / whole)))
+    total_steps: steps until max_epochs or max_steps; infinite where only time ends the training.
+    Every process of a distributed run gets the same value. None for a training without an end.
+    """
+    timer = next((c for c in trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
+    remaining = None if timer is None else timer.time_remaining()
+    if timer is None or remaining is None:
+        if math.isinf(total_steps):
+            return None
+        return lambda step: step / max(1.0, total_steps)
+    max_time = remaining + timer.time_elapsed()
 
-    return spent
+    @lru_cache(maxsize=1)  # the parameter groups ask one after the other
+    def progress(step: int) -> float:
+        elapsed = float(trainer.strategy.broadcast(timer.time_elapsed() / max_time))
+        return max(elapsed, step / max(1.0, total_steps))
+
+    return progress

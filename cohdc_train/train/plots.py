@@ -192,6 +192,18 @@ def _number(value: float) -> str:
     return "undefined" if np.isnan(value) else f"{value:.3f}"
 
 
+def plot_lr_find(rates: Sequence[float], losses: Sequence[float], suggestion: float) -> bytes:
+    """Plot the loss over the learning rate of a range test, and the rate that it suggests."""
+    figure = _figure(8, 5)
+    axes = figure.subplots()
+    axes.plot(rates, losses, label="loss, smoothed")
+    axes.axvline(suggestion, color="C3", linestyle="--", label=f"suggested {suggestion:.1e}")
+    axes.set(xscale="log", xlabel="learning rate", ylabel="training loss")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    return _png(figure)
+
+
 def _figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure
 

@@ -31,11 +31,13 @@ def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
     network: dict[str, Any] = {"anchor_scales": [scale, 2 * scale, 4 * scale, 8 * scale]}
     if pretrained:
         network["weights"] = "IMAGENET1K_V1"
-    expected = {
+    expected: dict[str, Any] = {
         "data": {"canvas": [height, width], "mini_mask": [mini, mini], "subset": {"train": train, "val": val}},
         "model": {"network": network, "optimizer": {"name": "sgd", "lr": lr}},
         "trainer": {"max_epochs": epochs},
     }
+    if not pretrained:
+        expected["pretrained"] = "none"
     shipped = config_path(f"configs/table3/test{test:02d}.yaml")
     assert yaml.safe_load(shipped.read_text(encoding="utf-8")) == expected
 
@@ -66,4 +68,4 @@ def test_a_network_and_a_recipe_add_up(capsys: pytest.CaptureFixture[str], tmp_p
     with pytest.raises(SystemExit):
         fit([*both, f"--data.root={tmp_path}", "--print_config"])
     network = yaml.safe_load(capsys.readouterr().out)["model"]["network"]
-    assert (network["backbone"], network["fpn_channels"], network["norm"]) == ("mobilenet_v2", 64, "frozen")
+    assert (network["backbone"], network["fpn_channels"], network["mask_cut"]) == ("mobilenet_v2", 64, "quality")

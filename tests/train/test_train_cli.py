@@ -1,9 +1,11 @@
 """`cohdc fit` and `cohdc validate` on six drawn images with a tiny network."""
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
+from urllib.error import URLError
 
 import pytest
 import torch
@@ -23,7 +25,7 @@ data: {canvas: [48, 64], workers: 0}
 model:
   network: {depth: 18, width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16,
             proposals: [50, 20]}
-trainer: {accelerator: cpu, max_epochs: 1, enable_model_summary: false}
+trainer: {accelerator: cpu, max_epochs: 1, enable_model_summary: false, precision: 32-true}
 pictures: false
 """
 
@@ -42,7 +44,7 @@ def arguments(toy: Path, out: Path, *more: str) -> list[str]:
 @pytest.fixture(scope="module")
 def run(toy: Path) -> Path:
     out = toy / "run"
-    fit(arguments(toy, out))
+    fit(arguments(toy, out, "--trainer.log_every_n_steps=1"))
     return out
 
 
@@ -104,6 +106,85 @@ def test_the_last_checkpoint_is_of_the_last_epoch_even_when_an_earlier_one_is_be
     fit(arguments(toy, out, "--trainer.max_epochs=3", "--model.optimizer.lr=1e-12"))
     epochs = {name: torch.load(out / f"{name}.ckpt", weights_only=True)["epoch"] for name in ("best", "last")}
     assert epochs == {"best": 0, "last": 2}
+
+
+def test_training_logs_rates_speed_and_time_left(run: Path) -> None:
+    (log,) = (run / "logs").glob("*/metrics.csv")
+    header = set(log.read_text().splitlines()[0].split(","))
+    assert {"lr/heads", "lr/backbone", "speed/images_per_s", "speed/minutes_left", "train/loss"} <= header
+    assert {"val/segm_AP/person", "val/segm_AP/car"} <= header
+
+
+def test_training_ends_with_scores_files_and_the_next_command(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(arguments(toy, tmp_path))
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
+    end = "\n".join(lines[-6:])
+    assert re.search(r"^best\.ckpt: mask AP \d\.\d{3}, AP50 \d\.\d{3} on the validation split$", end, re.M)
+    assert re.search(r"^mask AP per class: person \d\.\d{3}, car \d\.\d{3}$", end, re.M)
+    assert re.search(r"^hint: AP50 is 0\.\d+ after 3 steps from random weights on 6 images", end, re.M)
+    assert f"files: {tmp_path / 'best.ckpt'}" in end
+    assert lines[-1] == f"next:  cohdc export {tmp_path / 'best.ckpt'} --images {toy / 'images'}"
+    assert any(re.match(r"step 3; 6 images, .*loss .*lr .*mask AP .*AP50", line) for line in lines)
+
+
+def test_best_checkpoint_exists_when_no_validation_was_due(toy: Path, tmp_path: Path) -> None:
+    fit(arguments(toy, tmp_path, "--trainer.max_epochs=2", "--trainer.check_val_every_n_epoch=50"))
+    best = torch.load(tmp_path / "best.ckpt", weights_only=True)
+    last = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    assert best["global_step"] == last["global_step"] == 6
+    assert MaskRCNNModule.load(tmp_path / "best.ckpt").class_names == ["person", "car"]
+
+
+def test_training_stops_after_its_minutes(toy: Path, tmp_path: Path) -> None:
+    trainer = fit(arguments(toy, tmp_path, "--minutes=0.05", "--trainer.max_epochs=-1"))
+    assert 0 < trainer.global_step < 2000
+    assert {"best.ckpt", "last.ckpt"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_canvas_is_chosen_from_the_images_and_saved(toy: Path, tmp_path: Path) -> None:
+    (toy / "auto.yaml").write_text(TINY.replace("canvas: [48, 64]", "canvas: auto"), encoding="utf-8")
+    fit(["--config", str(toy / "auto.yaml"), f"--data.root={toy}", f"--out={tmp_path}"])
+    canvas = tuple(yaml.safe_load((tmp_path / "config.yaml").read_text())["data"]["canvas"])
+    module = MaskRCNNModule.load(tmp_path / "best.ckpt")
+    assert module.network_config.canvas == canvas
+    assert all(side % 32 == 0 for side in canvas)
+
+
+def test_overfit_trains_and_validates_on_the_same_images(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = fit(arguments(toy, tmp_path, "--overfit=2", "--trainer.max_steps=2"))
+    data = trainer.datamodule  # type: ignore[attr-defined]
+    assert data.folder.train[0].images == data.folder.val.images
+    assert len(data.folder.val.images) == 2
+    assert data.augment.flip == 0
+    assert "overfit: AP50" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_lr_find_suggests_a_rate_and_trains_nothing(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(arguments(toy, tmp_path, "--lr_find=true", "--trainer.max_epochs=100"))
+    assert "lr find: " in capsys.readouterr().out
+    assert not (tmp_path / "best.ckpt").exists()
+
+
+def test_failed_download_names_the_flag_for_a_local_file(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def offline(*_: Any, **__: Any) -> None:
+        raise URLError("no route to host")
+
+    monkeypatch.setattr("torch.hub.load_state_dict_from_url", offline)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", offline)
+    wide = ("--model.network.width=1.0", "--model.network.depth=18")
+    assert main(["fit", *arguments(toy, tmp_path, *wide)]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "IMAGENET1K_V1 of resnet18" in last
+    assert "no route to host" in last
+    assert "--pretrained FILE.pth" in last
 
 
 @pytest.mark.filterwarnings("ignore:The dirpath has changed")  # a true warning, and here the intention
@@ -182,6 +263,7 @@ def test_an_unreadable_image_is_told_in_one_line_from_a_worker(tmp_path: Path) -
         (["--data.classes=[dog]"], "'dog'"),
         (["--ckpt_path=nowhere.ckpt"], "nowhere.ckpt"),
         (["--pretrained=nowhere.ckpt"], "nowhere.ckpt"),
+        (["--pretrained=person"], "layers"),
         (["--config=table3/test99.yaml"], "test99.yaml"),
     ],
 )
@@ -209,10 +291,13 @@ def test_several_roots_are_a_list(toy: Path, capsys: pytest.CaptureFixture[str])
 
 def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        fit(["--print_config"])
+        fit(["DATA", "--print_config"])
     assert stop.value.code == 0
     shown: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
-    assert shown["data"]["canvas"] == [800, 1024]
+    assert shown["data"]["root"] == "DATA"
+    assert shown["data"]["canvas"] == "auto"
+    assert shown["model"]["network"]["backbone"] == "mobilenet_v2"  # networks/hdc_net_n.yaml
+    assert shown["pretrained"] == "auto"
     assert shown["checkpoint"]["monitor"] == "val/segm_AP"
     assert shown["pictures"] is True
 

@@ -1,5 +1,6 @@
-"""Schedule, parameter groups, and what the backbone gets of them."""
+"""Learning-rate schedule and parameter groups."""
 
+import math
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from lightning.pytorch.callbacks import Timer
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, time_spent
+from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, training_progress
 
 TINY = NetworkConfig(depth=18, width=0.125, fpn_channels=8, fc=16, canvas=(32, 32))
 
@@ -33,20 +34,32 @@ def module(total: float = 1000, **options: Any) -> MaskRCNNModule:
     return built
 
 
-def test_the_rate_warms_up_linearly_and_ends_at_its_fraction() -> None:
-    config = OptimizerConfig(warmup_steps=50, final_fraction=0.1)
-    assert config.factor(0, 1000) == pytest.approx(1 / 51)
-    assert config.factor(24, 1000) == pytest.approx(25 / 51)
-    assert config.factor(50, 1000) == pytest.approx(1.0)
-    assert config.factor(525, 1000) == pytest.approx(0.55)
-    assert config.factor(1000, 1000) == pytest.approx(0.1)
-    assert OptimizerConfig(final_fraction=1.0).factor(900, 1000) == 1.0
+def test_rate_warms_up_and_ends_at_its_fraction() -> None:
+    config = OptimizerConfig(warmup_ratio=0.1, final_fraction=0.1)
+    assert config.factor(0, 0.05) == pytest.approx(0.5 * (0.1 + 0.9 * 0.5 * (1 + math.cos(0.05 * math.pi))))
+    assert config.factor(0, 0.5) == pytest.approx(0.55)
+    assert config.factor(0, 1.0) == pytest.approx(0.1)
+    assert OptimizerConfig(final_fraction=1.0).factor(0, 0.9) == 1.0
 
 
-@given(total=st.integers(1, 5000), warmup=st.integers(0, 500))
-def test_the_rate_rises_then_falls(total: int, warmup: int) -> None:
-    config = OptimizerConfig(warmup_steps=warmup)
-    factors = [config.factor(step, total) for step in range(0, total + 1, max(1, total // 50))]
+def test_warmup_in_steps_replaces_the_share_of_the_budget() -> None:
+    config = OptimizerConfig(warmup_steps=9, final_fraction=1.0)
+    assert [config.factor(step, 0.5) for step in (0, 4, 9, 50)] == pytest.approx([0.1, 0.5, 1.0, 1.0])
+
+
+@given(warmup=st.floats(0.0, 0.5), first=st.floats(0.0, 1.0), second=st.floats(0.0, 1.0))
+def test_rate_is_continuous_in_the_budget_used(warmup: float, first: float, second: float) -> None:
+    """No jump at the end of the warm-up, wherever steps or a clock put the training."""
+    config = OptimizerConfig(warmup_ratio=warmup)
+    steepest = 1 / max(warmup, 1e-9) + math.pi / 2
+    change = abs(config.factor(5, first) - config.factor(5, second))
+    assert change <= steepest * abs(first - second) + 1.1e-3  # the first step has 1e-3 of the rate, never 0
+
+
+@given(warmup=st.floats(0.0, 0.5))
+def test_rate_rises_then_falls(warmup: float) -> None:
+    config = OptimizerConfig(warmup_ratio=warmup)
+    factors = [config.factor(0, i / 100) for i in range(101)]
     peak = factors.index(max(factors))
     assert factors[: peak + 1] == sorted(factors[: peak + 1])
     assert factors[peak:] == sorted(factors[peak:], reverse=True)
@@ -72,43 +85,55 @@ def test_frozen_stages_are_not_optimized() -> None:
 
 
 def test_a_schedule_without_an_end_is_refused() -> None:
-    with pytest.raises(CohdcError, match="max_epochs"):
+    with pytest.raises(CohdcError, match="--minutes"):
         module(total=float("inf")).configure_optimizers()
 
 
-def test_the_rate_falls_with_the_time_where_that_ends_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rate_follows_the_clock_where_time_ends_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = {"now": 0.0}
     monkeypatch.setattr(Timer, "time_elapsed", lambda self, stage="train": clock["now"])
     options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = Trainer(max_epochs=-1, max_time={"seconds": 100}, **options)
-    spent = time_spent(trainer)
-    assert spent is not None
-    config = OptimizerConfig(warmup_steps=10, lr=1.0, final_fraction=0.0, backbone_lr=0.5, frozen_steps=3)
-    optimizer, schedule = build_optimizer(config, MaskRCNN(1, TINY), 2**31, False, spent)
+    progress = training_progress(trainer, math.inf)
+    assert progress is not None
+    config = OptimizerConfig(warmup_ratio=0.1, lr=1.0, final_fraction=0.0, backbone_lr=0.5, frozen_steps=3)
+    optimizer, schedule = build_optimizer(config, MaskRCNN(1, TINY), progress, False)
     rates = []
-    for seconds in (5.0, *range(10, 101, 10)):  # of ten steps of warm-up, the clock's beginning is not seen
-        for _ in range(11):
+    for seconds in range(5, 101, 5):
+        for _ in range(4):
             clock["now"] = float(seconds)
             optimizer.step()
             schedule.step()
         rates.append(schedule.get_last_lr())
-    assert [head for head, *_ in rates] == pytest.approx(
-        [config.factor(11, 2**31, s / 100) for s in (5, *range(10, 101, 10))]
-    )
-    assert rates[5][0] == pytest.approx(0.5)
+    assert [heads for heads, *_ in rates] == pytest.approx([config.factor(0, s / 100) for s in range(5, 101, 5)])
+    assert rates[9][0] == pytest.approx(0.5)
     assert rates[-1][0] == pytest.approx(0.0, abs=1e-12)
-    assert all(body == pytest.approx(0.5 * head) for head, _, body, *_ in rates)
-    assert time_spent(Trainer(max_epochs=3, **options)) is None
+    assert all(body == pytest.approx(0.5 * heads) for heads, _, body, *_ in rates)
 
 
-@pytest.mark.parametrize("options", [{"lr": 0.0}, {"final_fraction": 1.5}, {"backbone_lr": -1.0}])
+def test_progress_is_the_further_of_steps_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Timer, "time_elapsed", lambda self, stage="train": 30.0)
+    options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    timed = training_progress(Trainer(max_epochs=3, max_time={"seconds": 100}, **options), 50)
+    counted = training_progress(Trainer(max_epochs=3, **options), 50)
+    assert timed is not None
+    assert counted is not None
+    assert [timed(step) for step in (0, 10, 25)] == pytest.approx([0.3, 0.3, 0.5])
+    assert [counted(step) for step in (0, 10, 25)] == pytest.approx([0.0, 0.2, 0.5])
+    assert training_progress(Trainer(max_epochs=-1, **options), math.inf) is None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"lr": 0.0}, {"final_fraction": 1.5}, {"backbone_lr": -1.0}, {"warmup_ratio": 1.0}, {"warmup_steps": -1}],
+)
 def test_senseless_rates_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="lr"):
+    with pytest.raises(ValueError, match=r"lr|warmup"):
         OptimizerConfig(**options)  # type: ignore[arg-type]
 
 
 def rates(built: MaskRCNNModule, steps: int) -> list[tuple[float, float]]:
-    """Learning rates of the backbone and of what stands around it, step by step."""
+    """Return the learning rates of the backbone and of the rest, step by step."""
     configured = built.configure_optimizers()
     optimizer, schedule = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
     body = {id(p) for p in built.network.backbone.body.parameters()}
@@ -121,14 +146,14 @@ def rates(built: MaskRCNNModule, steps: int) -> list[tuple[float, float]]:
     return found
 
 
-def test_the_backbone_rests_then_follows_at_its_share() -> None:
+def test_backbone_is_frozen_then_follows_at_its_share() -> None:
     found = rates(module(total=20, lr=1e-3, warmup_steps=0, frozen_steps=5, backbone_lr=0.1, final_fraction=1.0), 20)
     assert [backbone for backbone, _ in found] == pytest.approx([0.0] * 5 + [1e-4] * 15)
     assert [rest for _, rest in found] == pytest.approx([1e-3] * 20)
 
 
 @pytest.mark.parametrize("name", ["sgd", "adamw"])
-def test_a_resting_backbone_stays_as_it_is(name: Any) -> None:
+def test_frozen_backbone_keeps_its_weights(name: Any) -> None:
     torch.manual_seed(0)
     built = module(total=10, name=name, lr=0.1, frozen_steps=2, warmup_steps=0)
     configured = built.configure_optimizers()

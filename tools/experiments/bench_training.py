@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Training and validation of this project against plain torchvision and pycocotools loops, paired on one machine.
 
-    tools/bench_training --data ROOT [--classes person] [--canvas 320 416] [--threads 1] [--blocks 8] [--out FILE.json]
+    tools/experiments/bench_training.py --data ROOT [--classes person] [--canvas 320 416] [--threads 1]
+        [--blocks 8] [--out FILE.json]
 
 Both sides train the same ResNet-18 Mask R-CNN from the same weights on the same images in the same order; ours has its
 CQE head besides. The reference does what torchvision's detection training does: CocoDetection, polygons to masks,

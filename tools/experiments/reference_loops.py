@@ -1,4 +1,4 @@
-"""What tools/bench_training compares with: torchvision's detection training and evaluation, in our own words."""
+"""Torchvision's detection training and evaluation, in our own words: what the experiments compare with."""
 
 import argparse
 import contextlib
@@ -13,7 +13,10 @@ from pycocotools.cocoeval import COCOeval
 from torch.utils.data import DataLoader, Subset
 from torchvision.datasets import CocoDetection
 from torchvision.models.detection import MaskRCNN
+from torchvision.ops import FrozenBatchNorm2d
 from torchvision.transforms.v2.functional import horizontal_flip, pil_to_tensor, to_dtype
+
+from cohdc_train.models.staged import FrozenNorm
 
 
 def train(module: Any, data: Any, positions: list[int], args: argparse.Namespace, gate: Any) -> None:
@@ -53,12 +56,20 @@ def validate(module: Any, data: Any, args: argparse.Namespace, gate: Any) -> Non
             with torch.inference_mode():
                 (found,) = network([picture])
             rows += result_rows(image_id, found, images.category)
-        stats = {kind: coco_ap(images, chosen, rows, kind) for kind in ("bbox", "segm")}
+        stats = {kind: coco_stats(images, chosen, rows, kind)[0] for kind in ("bbox", "segm")}
     print(f"reference: segm AP {stats['segm']:.3f}, box AP {stats['bbox']:.3f}", flush=True)
 
 
-def coco_ap(images: "Images", chosen: list[int], rows: list[dict[str, Any]], kind: str) -> float:
-    """COCO's AP of boxes ("bbox") or masks ("segm") over the chosen image ids."""
+def coco_scores(images: "Images", chosen: list[int], rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Return mask AP, mask AP50 and box AP by pycocotools over the chosen image ids; 0 without a detection."""
+    if not rows:
+        return {"AP": 0.0, "AP50": 0.0, "box_AP": 0.0}
+    masks, boxes = (coco_stats(images, chosen, rows, kind) for kind in ("segm", "bbox"))
+    return {"AP": masks[0], "AP50": masks[1], "box_AP": boxes[0]}
+
+
+def coco_stats(images: "Images", chosen: list[int], rows: list[dict[str, Any]], kind: str) -> list[float]:
+    """Return pycocotools' twelve figures of boxes ("bbox") or masks ("segm") over the chosen image ids."""
     other = "bbox" if kind == "segm" else "segmentation"
     truth = images.coco.coco
     with contextlib.redirect_stdout(io.StringIO()):
@@ -68,7 +79,7 @@ def coco_ap(images: "Images", chosen: list[int], rows: list[dict[str, Any]], kin
         scored.evaluate()
         scored.accumulate()
         scored.summarize()
-    return float(scored.stats[0])
+    return [float(value) for value in scored.stats]
 
 
 def result_rows(image_id: int, found: dict[str, Any], category: dict[int, int]) -> Iterator[dict[str, Any]]:
@@ -115,9 +126,21 @@ class Images:
         return to_dtype(image, torch.float32, scale=True), {"boxes": boxes, "labels": labels[keep], "masks": stacked}
 
 
+def with_torchvision_norms(network: torch.nn.Module) -> torch.nn.Module:
+    """Replace every frozen norm of a network by torchvision's own, in place."""
+    for module in list(network.modules()):
+        for name, child in list(module.named_children()):
+            if isinstance(child, FrozenNorm):
+                norm = FrozenBatchNorm2d(child.weight.numel(), child.eps)
+                norm.load_state_dict(child.state_dict())
+                setattr(module, name, norm)
+    return network
+
+
 def same_network(module: Any) -> Any:
-    """Torchvision's Mask R-CNN of the same parts and weights; every image is resized to the canvas."""
+    """Build torchvision's Mask R-CNN of the same parts and weights; every image is resized to the canvas."""
     ours, config = module.network, module.network_config
+    with_torchvision_norms(ours)
     heads = ours.roi_heads
     ours.backbone.out_channels = config.fpn_channels
     return MaskRCNN(

@@ -1,0 +1,139 @@
+"""Weights that a training starts from: `cohdc fit --pretrained`."""
+
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import yaml
+
+from cohdc_train.errors import CohdcError
+from cohdc_train.models import NetworkConfig
+from cohdc_train.presets import config_path, model_path, shipped_models
+
+FEW_IMAGES = 10_000  # below which random initial weights learn little
+SHIPPED = "person"  # the shipped network that networks of its layers start from
+_SHIPPED_CONFIG = "networks/hdc_net_n.yaml"
+_PUBLISHED = "IMAGENET1K_V1"
+# Fields of NetworkConfig that decide which layers there are, and their shapes.
+_SHAPE = ("backbone", "depth", "width", "finest_stride", "fpn_channels", "fc", "cqe", "mask_size", "head_norm")
+
+Network = Mapping[str, Any]  # the fields of NetworkConfig by name
+
+
+@dataclass(frozen=True)
+class InitialWeights:
+    """Where a training's first weights come from.
+
+    Attributes:
+        kind: "network" is a checkpoint or exported file with weights of all layers, "backbone" a state dict of the
+            backbone alone, "random" none, "resumed" the checkpoint of an interrupted training.
+        source: file, or torchvision's name of published backbone weights; empty without weights.
+        norm: norm of the backbone that these weights ask for: "frozen" or "batch".
+        reason: one clause on why there are no better ones, for "random"; empty otherwise.
+    """
+
+    kind: Literal["network", "backbone", "random", "resumed"]
+    source: str = ""
+    norm: Literal["frozen", "batch"] = "frozen"
+    reason: str = ""
+
+    def describe(self, num_images: int) -> str:
+        """Return one line for the user. num_images: training images."""
+        if self.kind == "random":
+            warning = f"; {num_images} images are few for that" if num_images < FEW_IMAGES else ""
+            return f"initial weights: random ({self.reason}){warning}"
+        named = {"network": "all layers of", "backbone": "backbone,", "resumed": "resumed from"}[self.kind]
+        return f"initial weights: {named} {self.source}"
+
+
+def choose_initial_weights(pretrained: str, network: Network, resumed: Path | None = None) -> InitialWeights:
+    """Choose the first weights of a training.
+
+    Args:
+        pretrained: "auto" for the best that are known, "none" for random ones, "imagenet" for the backbone's published
+            ones, a shipped network's name, or a file: a checkpoint, an exported ONNX, a state dict of the backbone.
+        network: fields of the network's config. `weights`, where it is given, is what "auto" takes.
+        resumed: checkpoint of an interrupted training, which holds all weights.
+
+    Raises:
+        CohdcError: there is no such file, or it cannot be read; one line names the flag.
+    """
+    if resumed is not None:
+        return InitialWeights("resumed", str(resumed))
+    if pretrained == "none":
+        return InitialWeights("random", norm="batch", reason="--pretrained none")
+    if pretrained == "imagenet":
+        return _published(network)
+    if pretrained != "auto":
+        return _of_file(pretrained)
+    if network["weights"] is not None:
+        return InitialWeights("backbone", str(network["weights"]))
+    if _has_layers_of_shipped(network):
+        return InitialWeights("network", SHIPPED)
+    if network["width"] != 1.0:
+        return InitialWeights("random", norm="batch", reason="no weights are published for a backbone of this width")
+    if network["backbone"] == "mobilenet_v1":
+        reason = "none are published for mobilenet_v1; --pretrained FILE.pth takes a local state dict"
+        return InitialWeights("random", norm="batch", reason=reason)
+    return _published(network)
+
+
+def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]:
+    """Return the fields of the network that follow from its initial weights: weights, norm and frozen_stages.
+
+    Raises CohdcError where a given norm cannot hold them.
+    """
+    is_exported = initial.kind == "network" and model_path(initial.source).suffix == ".onnx"
+    if is_exported and network["norm"] == "batch":
+        raise CohdcError(
+            f"{initial.source}: an exported file holds no norms to train; give --model.network.norm frozen, or start "
+            "from other weights with --pretrained"
+        )
+    resolved = {
+        "weights": initial.source if initial.kind == "backbone" else None,
+        "norm": initial.norm if network["norm"] == "auto" else network["norm"],
+        "frozen_stages": network["frozen_stages"],
+    }
+    if network["frozen_stages"] is None:
+        resolved["frozen_stages"] = 0 if initial.kind == "random" else 2
+    return resolved
+
+
+def _published(network: Network) -> InitialWeights:
+    if network["backbone"] == "mobilenet_v1":
+        raise CohdcError(
+            "torchvision publishes no weights for mobilenet_v1; give a local file with --pretrained FILE.pth, or start "
+            "from random weights with --pretrained none"
+        )
+    return InitialWeights("backbone", _PUBLISHED)
+
+
+def _of_file(pretrained: str) -> InitialWeights:
+    path = model_path(pretrained)
+    if not path.is_file():
+        names = ", ".join(shipped_models())
+        raise CohdcError(
+            f"{pretrained}: no such file; give auto, none, imagenet, a shipped network ({names}) or a file"
+        )
+    if path.suffix == ".onnx":
+        return InitialWeights("network", pretrained)
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+        reason = str(error).partition("\n")[0]
+        raise CohdcError(f"{path}: neither a checkpoint nor a state dict: {reason}") from error
+    if isinstance(stored, dict) and "hyper_parameters" in stored:
+        norm = stored["hyper_parameters"].get("network", {}).get("norm", "batch")
+        return InitialWeights("network", pretrained, norm)
+    return InitialWeights("backbone", pretrained)
+
+
+def _has_layers_of_shipped(network: Network) -> bool:
+    """Return whether the shipped network's weights fit: the same layers of the same shapes, but for the classes."""
+    fields = yaml.safe_load(config_path(_SHIPPED_CONFIG).read_text(encoding="utf-8"))["model"]["network"]
+    shipped = NetworkConfig(**fields)
+    names = [name for name in _SHAPE if name != "depth" or network["backbone"] == "resnet"]
+    return network["norm"] != "batch" and all(network[name] == getattr(shipped, name) for name in names)
