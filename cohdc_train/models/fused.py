@@ -1,13 +1,11 @@
 """A network made faster for inference: norms folded into the convolutions before them, weights channels last."""
 
 import copy
-from collections.abc import Iterator
-from itertools import pairwise
 
 import torch
 from torch import nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from cohdc_train.models.frozen_norm import conv_norm_pairs, fold_batch_norm
 from cohdc_train.models.mask_rcnn import MaskRCNN
 
 
@@ -19,19 +17,10 @@ def fused(network: MaskRCNN, dtype: torch.dtype | None = None) -> MaskRCNN:
     under autocast to it, which would else cast them anew for every batch.
     """
     copied = copy.deepcopy(network).eval().requires_grad_(False)
-    for module, name, norm_name in list(foldable(copied)):
-        convolution, norm = getattr(module, name), getattr(module, norm_name)
-        setattr(module, name, fuse_conv_bn_eval(convolution, norm))
+    for module, name, norm_name in list(conv_norm_pairs(copied)):
+        setattr(module, name, fold_batch_norm(getattr(module, name), getattr(module, norm_name)))
         setattr(module, norm_name, nn.Identity())
     for module in copied.modules():
         if dtype is not None and isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             module.to(dtype)
     return copied.to(memory_format=torch.channels_last)
-
-
-def foldable(network: nn.Module) -> Iterator[tuple[nn.Module, str, str]]:
-    """Every convolution with a norm right behind it: the module that has both, and their names in it."""
-    for module in network.modules():
-        for (name, first), (norm_name, second) in pairwise(module.named_children()):
-            if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
-                yield module, name, norm_name

@@ -8,27 +8,15 @@ from pathlib import Path
 from typing import Literal, Self
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from torchvision.models import get_model_weights
-from torchvision.ops import FrozenBatchNorm2d
 
+from cohdc_train.models.frozen_norm import FrozenNorm, apply_norms_in_convolutions
 from cohdc_train.models.hdc import cycle
 
 Rates = Sequence[Sequence[int]]
 Norm = Literal["batch", "frozen"]  # frozen keeps statistics and scale
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, RGB in 0..1
-
-
-class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not typed
-    """BatchNorm whose statistics, scale and shift are constants.
-
-    Torchvision's makes two passes over the map, and turns it into float32 in mixed precision; this makes one.
-    """
-
-    def forward(self, x: Tensor) -> Tensor:
-        """x: [B, C, H, W]. Returns the normalized map, same shape and dtype."""
-        return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
 
 
 def norm_layer(norm: Norm, eps: float = 1e-5) -> Callable[[int], nn.Module]:
@@ -77,6 +65,7 @@ class StagedBackbone(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        apply_norms_in_convolutions(self)
         self.frozen_stages = frozen_stages
         for frozen in self._frozen():
             frozen.requires_grad_(False)

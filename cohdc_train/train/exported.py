@@ -11,8 +11,7 @@ from onnx import ModelProto, NodeProto, numpy_helper
 from torch import Tensor, nn
 
 from cohdc_train.models import MaskRCNN, detect, fused
-from cohdc_train.models.fused import foldable
-from cohdc_train.models.staged import FrozenNorm
+from cohdc_train.models.frozen_norm import FrozenNorm, conv_norm_pairs
 from cohdc_train.signature import KEY_CLASSES
 
 _LAYERS = nn.Conv2d | nn.ConvTranspose2d | nn.Linear
@@ -44,7 +43,7 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
     numbered = iter(sorted(key for key in stored if isinstance(key, int)))
     if len(layers) != len(stored):
         raise ValueError(f"the file has {len(stored)} layers, the network {len(layers)}")
-    norms = {getattr(module, name): getattr(module, norm) for module, name, norm in foldable(network)}
+    norms = {getattr(module, name): getattr(module, norm) for module, name, norm in conv_norm_pairs(network)}
     own = dict(network.named_modules())
     for name in layers:
         key = name if name in stored else next(numbered, None)

@@ -6,10 +6,10 @@ from torchvision.models import mobilenet_v2, resnet18, resnet50
 from torchvision.models.feature_extraction import create_feature_extractor
 from torchvision.ops import FrozenBatchNorm2d
 
+from cohdc_train.models.frozen_norm import FrozenNorm
 from cohdc_train.models.mobilenet_v1 import MobileNetV1
 from cohdc_train.models.mobilenet_v2 import MobileNetV2
 from cohdc_train.models.resnet import HDCResNet
-from cohdc_train.models.staged import FrozenNorm
 
 PLAIN = ((1,),) * 4
 

@@ -1,11 +1,14 @@
 """The copy that validation runs: the same detections, no norm left, and nothing of it in the network it was made of."""
 
+import copy
+
 import pytest
 import torch
 from torch import nn
+from torchvision.ops import FrozenBatchNorm2d
 
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
-from cohdc_train.models.staged import FrozenNorm
+from cohdc_train.models.frozen_norm import FoldingConv2d, FrozenNorm, conv_norm_pairs, plain_convolution
 
 SHAPES = {
     "resnet18": {"depth": 18, "width": 0.25},
@@ -62,3 +65,24 @@ def test_every_norm_is_folded_and_the_network_keeps_its_own(shape):
     assert not [m for m in copied.modules() if isinstance(m, nn.BatchNorm2d | FrozenNorm)]
     assert not any(parameter.requires_grad for parameter in copied.parameters())
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_frozen_norms_are_applied_by_the_convolutions_with_equal_gradients(shape):
+    network = network_of(shape, "frozen").backbone.body.train()
+    reference = copy.deepcopy(network)
+    for module, name, norm_name in list(conv_norm_pairs(reference)):
+        plain_convolution(getattr(module, name))
+        norm = FrozenBatchNorm2d(getattr(module, norm_name).weight.numel(), getattr(module, norm_name).eps)
+        norm.load_state_dict(getattr(module, norm_name).state_dict())
+        setattr(module, norm_name, norm)
+    assert any(isinstance(module, FoldingConv2d) for module in network.modules())
+    assert list(network.state_dict()) == list(reference.state_dict())
+
+    image = torch.rand(1, 3, 64, 96)
+    ours, theirs = network(image)["3"], reference(image)["3"]
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
+    ours.square().mean().backward()
+    theirs.square().mean().backward()
+    for (name, parameter), other in zip(network.named_parameters(), reference.parameters(), strict=True):
+        torch.testing.assert_close(parameter.grad, other.grad, rtol=1e-3, atol=1e-4, msg=name)

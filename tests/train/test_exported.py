@@ -12,7 +12,7 @@ from cohdc_train.export.graph import write_graph
 from cohdc_train.export.pictures import drawn_images
 from cohdc_train.export.quantization import quantize
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
-from cohdc_train.models.staged import FrozenNorm
+from cohdc_train.models.frozen_norm import FrozenNorm
 from cohdc_train.train.module import MaskRCNNModule
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from pycocotools import mask as rle
 from pycocotools.cocoeval import COCOeval
+from torch import nn
 from torch.utils.data import DataLoader, Subset
 from torchvision.datasets import CocoDetection
 from torchvision.models.detection import MaskRCNN
 from torchvision.ops import FrozenBatchNorm2d
 from torchvision.transforms.v2.functional import horizontal_flip, pil_to_tensor, to_dtype
 
-from cohdc_train.models.staged import FrozenNorm
+from cohdc_train.models.frozen_norm import FrozenNorm, plain_convolution
 
 
 def train(module: Any, data: Any, positions: list[int], args: argparse.Namespace, gate: Any) -> None:
@@ -130,6 +131,8 @@ def with_torchvision_norms(network: torch.nn.Module) -> torch.nn.Module:
     """Replace every frozen norm of a network by torchvision's own, in place."""
     for module in list(network.modules()):
         for name, child in list(module.named_children()):
+            if isinstance(child, nn.Conv2d):
+                plain_convolution(child)
             if isinstance(child, FrozenNorm):
                 norm = FrozenBatchNorm2d(child.weight.numel(), child.eps)
                 norm.load_state_dict(child.state_dict())
