@@ -15,6 +15,7 @@ from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.optimizer import training_progress
 
 _WINDOW = 30  # steps over which the speed is averaged
+_CLASSES = 5  # whose AP stands in the line
 _SHOWN = "worst.jpg"  # validation image that goes to TensorBoard
 
 
@@ -95,7 +96,7 @@ class ProgressReporter(pl.Callback):
             f"{self.images_seen} images, {self.images_per_s():.1f}/s" if self._stamps else "",
             f"loss {np.mean(recent):.3f}" if recent else "",
             f"lr {learning_rates(trainer).get('lr/heads', 0.0):.1e}",
-            f"mask AP {scores['segm_AP']:.3f}, AP50 {scores['segm_AP50']:.3f}",
+            f"mask AP {scores['segm_AP']:.3f}, AP50 {scores['segm_AP50']:.3f}{_per_class(scores)}",
             f"{minutes:.1f} min" + ("" if left is None else f", {left:.1f} left"),
         ]
         return "; ".join(part for part in parts if part)
@@ -113,6 +114,15 @@ class ProgressReporter(pl.Callback):
             if isinstance(logger, TensorBoardLogger) and image is not None:
                 rgb = np.ascontiguousarray(image[:, :, ::-1])
                 logger.experiment.add_image("val/worst", rgb, trainer.global_step, dataformats="HWC")
+
+
+def _per_class(scores: dict[str, float]) -> str:
+    """Return mask AP of the first few classes in brackets; nothing for a single class."""
+    prefix = "segm_AP/"
+    classes = [(name.removeprefix(prefix), ap) for name, ap in scores.items() if name.startswith(prefix)]
+    shown = ", ".join(f"{name} {ap:.3f}" for name, ap in classes[:_CLASSES])
+    rest = ", ..." if len(classes) > _CLASSES else ""
+    return f" ({shown}{rest})" if classes else ""
 
 
 def learning_rates(trainer: pl.Trainer) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Learning-rate schedule and parameter groups."""
 
+import copy
 import math
 from typing import Any
 
@@ -167,3 +168,28 @@ def test_frozen_backbone_keeps_its_weights(name: Any) -> None:
         configured["lr_scheduler"]["scheduler"].step()
         moved.append((not torch.equal(body, before[0]), not torch.equal(other, before[1])))
     assert moved == [(False, True), (False, True), (True, True)]
+
+
+def test_resumed_schedule_goes_on_at_the_same_rates() -> None:
+    def built() -> tuple[Any, Any]:
+        configured = module(total=20, lr=1e-3).configure_optimizers()
+        return configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+
+    optimizer, schedule = built()
+    uninterrupted = []
+    for step in range(20):
+        uninterrupted.append(optimizer.param_groups[0]["lr"])
+        if step == 7:
+            stored = copy.deepcopy((optimizer.state_dict(), schedule.state_dict()))
+        optimizer.step()
+        schedule.step()
+
+    optimizer, schedule = built()
+    optimizer.load_state_dict(stored[0])
+    schedule.load_state_dict(stored[1])
+    resumed = []
+    for _ in range(7, 20):
+        resumed.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert resumed == uninterrupted[7:]
