@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tool_loader import load_tool
 
-from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.tum import Frame
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.tum import Frame
 
 pytest.importorskip("torch", reason="the tool reads people from COCO folders with the train extra")
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120, 5000.0)

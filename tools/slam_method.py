@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from cohdc_train.slam.method import Method
+from cohdc_train.slam.config import Method
 
 
 def add_method_option(parser: argparse.ArgumentParser) -> None:

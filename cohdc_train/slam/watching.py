@@ -5,9 +5,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.results import FrameRecord
-from cohdc_train.slam.source import View
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.io.results import FrameRecord
+from cohdc_train.slam.io.sources import View
+from cohdc_train.slam.tracking.tracker import Tracker
 
 
 class Watcher(Protocol):

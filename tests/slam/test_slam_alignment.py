@@ -8,10 +8,10 @@ from loop_world import poor_view, way_round
 from numpy.typing import NDArray
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
-from cohdc_train.slam.alignment import Picture, align, take_picture, warp_jacobian
-from cohdc_train.slam.features import FeatureExtractor
-from cohdc_train.slam.optimization import exp_se3, inverse, to_local
-from cohdc_train.slam.recognition import Places
+from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.loop_closing.place_recognition import Places
+from cohdc_train.slam.optimization.image_alignment import Picture, align, take_picture, warp_jacobian
+from cohdc_train.slam.optimization.pose import exp_se3, inverse, to_local
 
 Array = NDArray[np.float64]
 PATH = camera_path(20)

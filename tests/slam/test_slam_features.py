@@ -9,9 +9,9 @@ from plane_world import CAMERA, render, room
 
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
-from cohdc_train.slam.culling import Culling, dynamic_mask, grow
-from cohdc_train.slam.features import FeatureExtractor, Features, hamming, sample_depth, spread
-from cohdc_train.slam.matching import match_descriptors
+from cohdc_train.slam.dynamics.mask_sources import Culling, dynamic_mask, grow
+from cohdc_train.slam.features.matching import match_descriptors
+from cohdc_train.slam.features.orb import FeatureExtractor, Features, hamming, sample_depth, spread
 
 
 def test_the_mask_costs_no_budget() -> None:

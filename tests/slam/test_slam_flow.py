@@ -9,14 +9,14 @@ from at_once import AtOnce
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
-from cohdc_train.slam.features import Corners
-from cohdc_train.slam.flow_tracking import FlowTracker, Followed
-from cohdc_train.slam.matching import Matches
-from cohdc_train.slam.method import Method
-from cohdc_train.slam.motion import Expectation
-from cohdc_train.slam.optimization import Prior, exp_se3
-from cohdc_train.slam.pose import Pose
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.features.matching import Matches
+from cohdc_train.slam.features.orb import Corners
+from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.optimization.pose import Prior, exp_se3
+from cohdc_train.slam.tracking.flow_tracker import FlowTracker, Followed
+from cohdc_train.slam.tracking.motion_model import Expectation
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 FRAMES = 31
@@ -100,7 +100,7 @@ def test_the_answer_by_flow_comes_before_the_frame_is_matched(
 def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 1)
+    monkeypatch.setattr("cohdc_train.slam.tracking.tracker._KEYFRAME_FRAMES", 1)
     run = Watched(monkeypatch)
     work, worked = run.tracker._mapping.work, list[int]()
 
@@ -165,7 +165,7 @@ def test_of_many_points_a_frame_follows_every_second_and_the_next_the_others(
     flow, tracker = begun(views[0])
     assert tracker._last is not None
     every = flow.follow(views[0][0], None, np.eye(4))
-    monkeypatch.setattr("cohdc_train.slam.flow_tracking._MANY", len(tracker._last.matches))
+    monkeypatch.setattr("cohdc_train.slam.tracking.flow_tracker._MANY", len(tracker._last.matches))
     some, others = (flow.follow(views[0][0], None, np.eye(4)) for _ in range(2))
     assert every is not None
     assert some is not None

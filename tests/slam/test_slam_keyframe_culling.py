@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from plane_world import CAMERA, camera_path, render, room
 
-from cohdc_train.slam.keyframe_culling import cull_keyframes
-from cohdc_train.slam.map import Keyframe, Map
-from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, exp_se3
-from cohdc_train.slam.refinement import affine
-from cohdc_train.slam.tracking import Tracker
-from cohdc_train.slam.window import WINDOW, Solution, close_window, open_window
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
+from cohdc_train.slam.mapping.local_bundle_adjustment import WINDOW, Solution, close_window, open_window
+from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.mapping.patch_refiner import affine
+from cohdc_train.slam.optimization.pose import Array, exp_se3
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 ROUND = 20  # frames until the hand is back
@@ -25,9 +25,9 @@ def sway(rounds: int, **parts: bool) -> Tracker:
     tracker = Tracker(CAMERA, features=250, method=Method(**parts))
     views = [render(room(), T_wc)[:2] for T_wc in PATH]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_SHARE", 0.75)
-        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 2)
-        patch.setattr("cohdc_train.slam.tracking._OLD", 1000)
+        patch.setattr("cohdc_train.slam.tracking.tracker._KEYFRAME_SHARE", 0.75)
+        patch.setattr("cohdc_train.slam.tracking.tracker._KEYFRAME_FRAMES", 2)
+        patch.setattr("cohdc_train.slam.tracking.tracker._OLD", 1000)
         for number in range(rounds * ROUND):
             assert tracker.track(*views[number % ROUND], number / 30).tracked
     return tracker
@@ -72,8 +72,8 @@ def test_a_known_place_needs_no_keyframe() -> None:
     rgb, depth, _ = render(room(), PATH[0])
     tracker = Tracker(CAMERA, features=250)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_SHARE", 0.75)
-        patch.setattr("cohdc_train.slam.tracking._KEYFRAME_FRAMES", 1)
+        patch.setattr("cohdc_train.slam.tracking.tracker._KEYFRAME_SHARE", 0.75)
+        patch.setattr("cohdc_train.slam.tracking.tracker._KEYFRAME_FRAMES", 1)
         for number in range(12):
             tracker.track(rgb, depth, number / 30)
     later = [tracker.track(rgb, depth, (12 + number) / 30) for number in range(120)]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from plane_world import write_sequence
 from tool_loader import load_tool
 
+from cohdc_train.slam.io.sources import View
 from cohdc_train.slam.run import slam
-from cohdc_train.slam.source import View
 
 
 @pytest.fixture(scope="module")

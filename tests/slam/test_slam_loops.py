@@ -7,14 +7,14 @@ import pytest
 from loop_world import View, poor_view, way_round
 from plane_world import CAMERA
 
-from cohdc_train.slam.alignment import Picture, take_picture
-from cohdc_train.slam.map import Keyframe, Map, observations
-from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Weighing, chi_square, exp_se3, inverse
-from cohdc_train.slam.pose import Pose
-from cohdc_train.slam.tracking import Tracker
-from cohdc_train.slam.verification import Loop, Verifier
-from cohdc_train.slam.window import adjust_everything
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.loop_closing.verification import Loop, Verifier
+from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_everything
+from cohdc_train.slam.mapping.map import Keyframe, Map, observations
+from cohdc_train.slam.optimization.image_alignment import Picture, take_picture
+from cohdc_train.slam.optimization.pose import Weighing, chi_square, exp_se3, inverse
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 FRAMES = 180

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room, write_sequence
 
 from cohdc_train.cli import main
-from cohdc_train.slam.dense_map import fuse, sure, unmasked
-from cohdc_train.slam.ply import write_ply
+from cohdc_train.slam.io.ply import write_ply
 from cohdc_train.slam.run import slam
-from cohdc_train.slam.sparse_map import Cloud, from_above
-from cohdc_train.slam.voxels import VoxelGrid
+from cohdc_train.slam.visualization.depth_fusion import fuse, sure, unmasked
+from cohdc_train.slam.visualization.point_cloud import Cloud, from_above
+from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 Points = NDArray[np.float64]
 

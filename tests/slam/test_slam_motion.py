@@ -5,10 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
-from cohdc_train.slam import motion as motion_module
-from cohdc_train.slam.method import Method
-from cohdc_train.slam.motion import _EXACT, ACCELERATION, Motion
-from cohdc_train.slam.optimization import (
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.optimization.pose import (
     Observations,
     Prior,
     Weighing,
@@ -19,7 +17,9 @@ from cohdc_train.slam.optimization import (
     pose_information,
     to_local,
 )
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.tracking import motion_model as motion_module
+from cohdc_train.slam.tracking.motion_model import _EXACT, ACCELERATION, Motion
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 SURE = 1e12 * np.eye(6)

@@ -10,19 +10,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
-from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.dynamic_mask import DynamicMask
-from cohdc_train.slam.features import FeatureExtractor
-from cohdc_train.slam.geometry import Geometry, Reference
-from cohdc_train.slam.live import Live
-from cohdc_train.slam.map import Keyframe, Map
-from cohdc_train.slam.method import Method
-from cohdc_train.slam.optimization import Array, Observations, Weighing, exp_se3, optimize_pose
-from cohdc_train.slam.playback import play
-from cohdc_train.slam.results import FrameRecord
-from cohdc_train.slam.rigidity import moving_group, pose_of_rest
-from cohdc_train.slam.source import View
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.dynamics.dynamic_mask import DynamicMask
+from cohdc_train.slam.dynamics.free_space import Geometry, Reference
+from cohdc_train.slam.dynamics.motion_segmentation import moving_group, pose_of_rest
+from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.live import Live
+from cohdc_train.slam.io.results import FrameRecord
+from cohdc_train.slam.io.sources import View
+from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.optimization.pose import Array, Observations, Weighing, exp_se3, optimize_pose
+from cohdc_train.slam.runner import play
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 WEIGHING = Weighing(CAMERA)

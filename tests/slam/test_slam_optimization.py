@@ -9,8 +9,8 @@ from plane_world import CAMERA
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
-from cohdc_train.slam.bundle_adjustment import Problem, adjust, local_points, measurement_chi2
-from cohdc_train.slam.optimization import (
+from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, local_points, measurement_chi2
+from cohdc_train.slam.optimization.pose import (
     CHI2_DEPTH,
     Observations,
     Weighing,
@@ -23,7 +23,7 @@ from cohdc_train.slam.optimization import (
     skew,
     to_local,
 )
-from cohdc_train.slam.ransac import ransac_pose, rigid_transforms
+from cohdc_train.slam.optimization.ransac import ransac_pose, rigid_transforms
 
 Array = NDArray[np.float64]
 WEIGHING = Weighing(CAMERA)

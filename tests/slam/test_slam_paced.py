@@ -8,9 +8,9 @@ import pytest
 from plane_world import CAMERA
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.paced import Paced
-from cohdc_train.slam.slot import Slot
-from cohdc_train.slam.source import View
+from cohdc_train.slam.io.sources import View
+from cohdc_train.slam.runtime.latest_slot import Slot
+from cohdc_train.slam.runtime.paced_source import Paced
 
 LONG = 20.0  # s: no wait of a thread here takes that long unless it hangs
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import logm
 
-from cohdc_train.slam.optimization import exp_se3, inverse, log_se3
-from cohdc_train.slam.pose_graph import Edges, edge_errors, edge_jacobians, optimize_graph
+from cohdc_train.slam.optimization.pose import exp_se3, inverse, log_se3
+from cohdc_train.slam.optimization.pose_graph import Edges, edge_errors, edge_jacobians, optimize_graph
 
 Array = NDArray[np.float64]
 SIGMA = np.array([0.01, 0.003])  # m, rad of every edge

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import texture
 
-from cohdc_train.slam.propagation import Half, Mask, Propagation, cut_by_depth, halve, halve_mask
+from cohdc_train.slam.dynamics.mask_propagation import Half, Mask, Propagation, cut_by_depth, halve, halve_mask
 
 HEIGHT, WIDTH = 240, 320
 WALL, PERSON = 3.0, 1.5  # m

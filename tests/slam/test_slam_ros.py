@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from tool_loader import load_tool
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.camera import Camera
-from cohdc_train.slam.ros_messages import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
 from cohdc_train.trajectory import read_tum
 
 FRAMES = 8

@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plane_world import CAMERA, camera_path, render, room
 
-from cohdc_train.slam import smoothing
-from cohdc_train.slam.method import Method
-from cohdc_train.slam.motion import ACCELERATION
-from cohdc_train.slam.optimization import Array, Prior, exp_se3, inverse, log_se3
-from cohdc_train.slam.smoothing import smoothed
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.optimization import trajectory_smoothing as smoothing
+from cohdc_train.slam.optimization.pose import Array, Prior, exp_se3, inverse, log_se3
+from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
+from cohdc_train.slam.tracking.motion_model import ACCELERATION
+from cohdc_train.slam.tracking.tracker import Tracker
 
 
 def noisy(seed: int, frames: int, sigma: float, pace: float = 0.25) -> tuple[Array, Array, Array, Array]:

@@ -13,9 +13,9 @@ from plane_world import CAMERA, CAMERA_YAML, camera_path, passer_by, render, roo
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
-from cohdc_train.slam.camera import Camera, load_camera
-from cohdc_train.slam.source import Recorded
-from cohdc_train.slam.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_layout
+from cohdc_train.slam.geometry.camera import Camera, load_camera
+from cohdc_train.slam.io.sources import Recorded
+from cohdc_train.slam.io.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_layout
 
 BASELINE = 0.12
 PAIR = Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1.0, baseline=BASELINE)

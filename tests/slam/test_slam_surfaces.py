@@ -12,9 +12,9 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cohdc_train.slam.optimization import exp_se3
-from cohdc_train.slam.surfaces import JUMP, Bits, Movers, surfaces
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.dynamics.moving_surfaces import JUMP, Bits, Movers, surfaces
+from cohdc_train.slam.optimization.pose import exp_se3
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 SHAPE = (30, 40)

@@ -5,11 +5,11 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
-from cohdc_train.slam.features import Corners, Features
-from cohdc_train.slam.matching import Matches, Projected, match_projected, one_to_one
-from cohdc_train.slam.optimization import exp_se3, inverse
-from cohdc_train.slam.pose import Pose
-from cohdc_train.slam.tracking import Tracker
+from cohdc_train.slam.features.matching import Matches, Projected, match_projected, one_to_one
+from cohdc_train.slam.features.orb import Corners, Features
+from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.optimization.pose import exp_se3, inverse
+from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 
 BLACK = np.zeros((240, 320, 3), dtype=np.uint8)
@@ -157,7 +157,7 @@ def test_a_pose_that_is_rejected_judges_no_point(views: list[View], monkeypatch:
         nothing = np.zeros(len(points), dtype=np.bool_)
         return T_cw, nothing, ~nothing
 
-    monkeypatch.setattr("cohdc_train.slam.localization.pose_of_rest", wrong)
+    monkeypatch.setattr("cohdc_train.slam.tracking.localizer.pose_of_rest", wrong)
     assert not tracker.track(*views[2][:2], 2 / 30).tracked
     np.testing.assert_array_equal(tracker.map.moved, 0)
 

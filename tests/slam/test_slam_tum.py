@@ -8,7 +8,7 @@ import pytest
 from plane_world import CAMERA
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.tum import read_depth, read_mask, read_rgb, read_sequence
+from cohdc_train.slam.io.tum import read_depth, read_mask, read_rgb, read_sequence
 
 
 def folder(tmp_path: Path, rgb: list[float], depth: list[float]) -> Path:

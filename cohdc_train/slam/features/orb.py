@@ -1,0 +1,258 @@
+"""ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that can be trusted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.optimization.pose import inverse, to_local
+
+SCALE = 1.2  # between two levels of the image pyramid
+LEVELS = 8
+_PRECISE = 0.3  # px at its level: standard deviation of a corner that was moved to where its point's patch fits best
+_SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
+_CELL = 32  # px at the level of the corner
+_POOL = 2.0  # corners detected per corner kept: what the grid chooses from
+_ENOUGH = 1.6  # the same, below which the next threshold is tried
+_THRESHOLDS = (40, 20, 12, 7)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
+_EDGE_PATCH = 2  # px: a depth edge this near to a corner spoils its depth
+_EDGE_RELATIVE = 0.04  # of the depth: a larger step inside the patch is an edge
+_MASK_BAND = 2  # px beside the mask where depth is refused
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where n corners lie in an image, and what they look like; fields as those of Features."""
+
+    pixels: NDArray[np.float64]
+    octaves: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+    precise: NDArray[np.bool_]
+
+    def take(self, rows: NDArray[np.int64]) -> "Corners":
+        """The chosen rows."""
+        return Corners(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.precise[rows])
+
+
+@dataclass(frozen=True)
+class Features:
+    """n corners of one frame.
+
+    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n] int64 pyramid level;
+    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted;
+    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to (`refinement`).
+    """
+
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+    octaves: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+    depths: NDArray[np.float64]
+    precise: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        n = len(self.pixels)
+        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.precise)
+        shapes = tuple(array.shape for array in arrays)
+        if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,), (n,)):
+            raise ValueError(f"features disagree in shape: {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def corners(self, rows: NDArray[np.int64]) -> Corners:
+        """The chosen rows, without what camera and depth said of them."""
+        return Corners(self.pixels, self.octaves, self.descriptors, self.precise).take(rows)
+
+    @property
+    def for_others(self) -> "Features":
+        """The same corners as measurements of other points than those by whose patches they are precise."""
+        return replace(self, precise=np.zeros_like(self.precise))
+
+    @property
+    def scales(self) -> NDArray[np.float64]:
+        """[n] px of the image per px of each corner's pyramid level."""
+        return np.asarray(SCALE**self.octaves, dtype=np.float64)
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less where precise."""
+        return np.where(self.precise, _PRECISE, 1.0) * self.scales
+
+
+class FeatureExtractor:
+    """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a crowd costs none."""
+
+    def __init__(self, camera: Camera, budget: int = 1000) -> None:
+        self.camera = camera
+        self.budget = budget
+        self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]
+        self._latest = 0  # threshold that was low enough for the latest frame
+        shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
+        self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
+
+    def __call__(
+        self,
+        rgb: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        mask: NDArray[np.bool_] | None = None,
+        lag: NDArray[np.float64] | None = None,
+    ) -> Features:
+        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there.
+
+        lag: [4, 4] from the camera's frame at the colour image's time to that at depth's, where they differ.
+        """
+        return self.measure(self.find(rgb, mask), depth, mask, lag)
+
+    def find(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Corners:
+        """The corners alone; arguments as above."""
+        gray = gray_of(rgb)
+        allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
+        found, table = self._detect(gray, allowed)
+        chosen = spread(table, self._quota)
+        kept, words = self._detectors[0].compute(gray, [found[i] for i in chosen])
+        if words is None:
+            kept, words = (), np.zeros((0, 32), dtype=np.uint8)
+        pixels, octaves = _places(kept)
+        pixels += 0.5 * (_SCALES[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
+        return Corners(pixels, octaves, np.ascontiguousarray(words).view(np.uint64), np.zeros(len(pixels), np.bool_))
+
+    def measure(
+        self,
+        corners: Corners,
+        depth: NDArray[np.float32],
+        mask: NDArray[np.bool_] | None = None,
+        lag: NDArray[np.float64] | None = None,
+    ) -> Features:
+        """What camera and depth image say of corners; arguments as above."""
+        pixels = corners.pixels
+        points = self.camera.undistort(pixels)
+        depths = sample_depth(depth, pixels, mask)
+        if lag is not None:
+            depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
+        return Features(pixels, points, corners.octaves, corners.descriptors, depths, corners.precise)
+
+    def _caught_up(
+        self,
+        depth: NDArray[np.float32],
+        corners: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+        mask: NDArray[np.bool_] | None,
+        lag: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Depths at the colour image's time: read where each corner was when depth was taken, and carried back.
+
+        A hand moves a Kinect by half a centimetre in the 17 ms that its two images lie apart.
+        """
+        pixels, points, depths = corners
+        there = self.camera.project(to_local(lag, self.camera.backproject(points, depths)))
+        shift = np.nan_to_num(there - points)
+        moved = sample_depth(depth, pixels + shift, mask)
+        return to_local(inverse(lag), self.camera.backproject(points + shift, moved))[:, 2]
+
+    def _detect(
+        self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None
+    ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float64]]:
+        """Corners above the highest threshold that leaves enough, and the table of them that `spread` takes.
+
+        Which threshold was tried first, the latest frame's, makes no difference to that: ORB's own order, which depends
+        on it and would decide between corners of one response, gives way to level, row and column.
+        """
+        enough = _ENOUGH * self.budget
+        for k in range(self._latest, len(_THRESHOLDS)):
+            found = self._detectors[k].detect(gray, allowed)
+            if len(found) >= enough:
+                break
+        responses = np.fromiter(map(attrgetter("response"), found), np.float64, len(found))
+        while k > 0 and np.count_nonzero(responses >= _THRESHOLDS[k - 1]) >= enough:
+            k -= 1
+        self._latest = k
+        places, octaves = _places(found)
+        order = np.lexsort((places[:, 0], places[:, 1], octaves))
+        order = order[responses[order] >= _THRESHOLDS[k]]
+        return [found[i] for i in order], np.column_stack([places, octaves, responses])[order]
+
+
+def gray_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """rgb: [H, W, 3] uint8 RGB. Returns [H, W] uint8."""
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """[n, 2] px and [n] pyramid levels."""
+    pixels = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64).reshape(-1, 2)
+    return pixels, np.fromiter(map(attrgetter("octave"), corners), np.int64, len(corners))
+
+
+def _orb(count: int, threshold: int) -> cv2.ORB:
+    return cv2.ORB.create(
+        nfeatures=count,
+        scaleFactor=SCALE,
+        nlevels=LEVELS,
+        edgeThreshold=19,
+        scoreType=cv2.ORB_FAST_SCORE,
+        fastThreshold=threshold,
+    )
+
+
+def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Choose corners evenly: per pyramid level, the best of every grid cell first, then every cell's second best.
+
+    table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level. Returns rising rows.
+    """
+    best_first = np.argsort(-table[:, 3], kind="stable")
+    octave = table[best_first, 2].astype(np.int64)
+    column, row = (table[best_first, :2].T // (_CELL * _SCALES)[octave]).astype(np.int64)
+    cell = (octave * 10_000 + row) * 10_000 + column
+    order = np.argsort(cell, kind="stable")
+    rank = np.empty(len(table), dtype=np.int64)
+    rank[order] = _running_index(cell[order])
+    order = np.argsort(octave * len(table) + rank, kind="stable")
+    chosen = order[_running_index(octave[order]) < quota[octave[order]]]
+    return np.sort(best_first[chosen])
+
+
+def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """groups: [n] sorted keys. Returns [n] 0, 1, 2, ... restarting at every new key."""
+    index = np.arange(len(groups))
+    starts = np.r_[True, groups[1:] != groups[:-1]][: len(groups)]
+    return np.asarray(index - np.maximum.accumulate(np.where(starts, index, 0)), dtype=np.int64)
+
+
+def sample_depth(
+    depth: NDArray[np.float32], pixels: NDArray[np.float64], mask: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """Depth at corners, refused beside depth edges and beside the mask, where a sensor mixes near and far.
+
+    depth: [H, W] m, 0 = none; pixels: [n, 2] px; mask: [H, W], True = dynamic. Returns [n] m, nan where refused.
+    """
+    if len(pixels) == 0:
+        return np.zeros(0)
+    height, width = depth.shape
+    offsets = np.arange(-_EDGE_PATCH, _EDGE_PATCH + 1)
+    x, y = np.rint(pixels).astype(np.int64).T
+    columns = np.clip(x + offsets[:, None], 0, width - 1)
+    rows = np.clip(y + offsets[:, None], 0, height - 1)
+    patch = depth.ravel().take((rows[:, None] * width + columns).reshape(-1, len(pixels)))  # [25, n]
+    centre = patch[len(patch) // 2].astype(np.float64)
+    far = patch.max(axis=0).astype(np.float64)
+    near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=0).astype(np.float64)
+    refused = (centre <= 0) | (far - near > _EDGE_RELATIVE * centre)
+    if mask is not None:
+        reach = np.ones((2 * _MASK_BAND + 1, 2 * _MASK_BAND + 1), dtype=np.uint8)
+        band = cv2.dilate(mask.astype(np.uint8), reach)
+        refused |= band[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0
+    return np.where(refused, np.nan, centre)
+
+
+def bits_of(descriptors: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """[n, 256] 0 or 1, of descriptors [n, 4]."""
+    return np.unpackbits(np.ascontiguousarray(descriptors).view(np.uint8).reshape(-1, 32), axis=1)
+
+
+def hamming(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """first, second: [..., 4] descriptors. Returns [...] how many of the 256 bits differ."""
+    return np.asarray(np.bitwise_count(first ^ second).sum(axis=-1, dtype=np.int64))

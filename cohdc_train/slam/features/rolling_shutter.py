@@ -1,0 +1,25 @@
+"""A rolling shutter: the rows of an image are read one after the other, while the camera moves on."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.optimization.pose import Array
+
+
+def unrolled(features: Features, camera: Camera, twist: Array) -> Features:
+    """The corners as a camera would have measured them that takes all rows at once, halfway through the readout.
+
+    twist: [6] velocity of the world in the camera's frame, (m/s, rad/s), a point moves by v + omega x X. Corners
+    without depth move as if at the median depth of the others.
+    """
+    depths = features.depths
+    if camera.readout == 0 or np.isnan(depths).all():
+        return features
+    late = camera.readout * (features.pixels[:, 1] / camera.height - 0.5)  # s after the middle row
+    known = np.where(np.isnan(depths), np.nanmedian(depths), depths)
+    local = camera.backproject(features.points, known)
+    local -= late[:, None] * (twist[:3] + np.cross(twist[3:], local))
+    return replace(features, points=camera.project(local), depths=np.where(np.isnan(depths), np.nan, local[:, 2]))

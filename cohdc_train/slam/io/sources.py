@@ -1,0 +1,95 @@
+"""Where frames come from: anything that gives one view after the other; here a recorded TUM sequence."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.tum import Entry, read_depth, read_pairs, read_rgb
+
+
+@dataclass(frozen=True)
+class View:
+    """One frame as the tracker takes it.
+
+    t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending, which a mask in a
+    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading; depth_t: s, when
+    depth was taken, where that differs from t; depth_ms: what it took to compute.
+    """
+
+    t: float
+    stamp: str
+    name: str
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    depth_t: float | None = None
+    depth_ms: float = 0.0
+
+
+class Source(Protocol):
+    """Views in the order of time, each made when it is asked for.
+
+    groundtruth: file in TUM's format, or None; without_depth: colour images left out for want of a depth image.
+    """
+
+    camera: Camera
+    groundtruth: Path | None
+    without_depth: int
+
+    def __len__(self) -> int:
+        """How many views will come, 0 where nobody knows."""
+        ...
+
+    def __iter__(self) -> Iterator[View]:
+        """The views. Raises DataError naming the file that cannot be used."""
+        ...
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a folder holds frames: two lists in the manner of TUM's rgb.txt, paired by their stamps.
+
+    max_difference: s between the two of a pair; view: makes a view of them, or raises DataError for an image that
+    cannot be used.
+    """
+
+    first: str
+    second: str
+    max_difference: float
+    view: Callable[[Entry, Entry], View]
+
+
+def rgbd_layout(camera: Camera) -> Layout:
+    """TUM's layout: rgb.txt and depth.txt."""
+
+    def view(colour: Entry, depth: Entry) -> View:
+        rgb, metres = read_rgb(colour.image, camera), read_depth(depth.image, camera)
+        return View(colour.t, colour.stamp, colour.image.stem, rgb, metres, depth.t)
+
+    return Layout("rgb.txt", "depth.txt", 0.02, view)
+
+
+class Recorded:
+    """A recorded sequence, in TUM's layout when no other is given.
+
+    Raises DataError as read_pairs does, and, while views are taken, for images that are broken or of another size.
+    """
+
+    def __init__(self, folder: Path, camera: Camera, layout: Layout | None = None) -> None:
+        self.camera = camera
+        self._layout = layout or rgbd_layout(camera)
+        lists = folder / self._layout.first, folder / self._layout.second
+        self._pairs, self.without_depth = read_pairs(*lists, self._layout.max_difference)
+        truth = folder / "groundtruth.txt"
+        self.groundtruth = truth if truth.is_file() else None
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[View]:
+        for first, second in self._pairs:
+            yield self._layout.view(first, second)

@@ -1,0 +1,1 @@
+"""Recognition of places seen before, and loop closure."""

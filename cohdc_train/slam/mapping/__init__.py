@@ -1,0 +1,1 @@
+"""The map of keyframes and points, and its upkeep."""

@@ -1,0 +1,82 @@
+"""Local bundle adjustment beside tracking, so that tracking never waits for it.
+
+No two threads ever touch the map. The tracker's thread takes arrays out of it (`open_window`), a worker process does
+the sums on its own copy, and the tracker's thread, between two frames, puts the result in (`close_window`). One window
+is under way at a time; a keyframe that joins meanwhile waits, and a newer one takes its place.
+"""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, Window, close_window, open_window, solve
+from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.optimization.pose import Array, Weighing
+
+NICE = 15  # a worker gives way to tracking when there are fewer cores than work
+
+
+class BackgroundMapper:
+    """Bundle adjustments, one after the other, in an executor."""
+
+    def __init__(self, executor: Executor, weighing: Weighing) -> None:
+        self._executor = executor
+        self._weighing = weighing
+        self._running: tuple[Window, Future[Solution]] | None = None
+        self._waiting: Keyframe | None = None
+
+    @property
+    def busy_with(self) -> set[int]:
+        """Indices of the keyframes that must stay in the map until `collect` has had them."""
+        waiting = set() if self._waiting is None else {self._waiting.index}
+        return waiting if self._running is None else waiting | {k.index for k in self._running[0].keyframes}
+
+    def start(self, world: Map, keyframe: Keyframe) -> None:
+        """Adjust the keyframe's window as soon as the one under way is done."""
+        if self._running is not None:
+            self._waiting = keyframe
+            return
+        window = open_window(world, keyframe)
+        poses = np.stack(window.poses)
+        job = self._executor.submit(solve, poses, window.points, window.problem, self._weighing)
+        self._running = window, job
+
+    def collect(self, world: Map) -> Array | None:
+        """Put a finished result into the map. Returns the motion of `close_window`, None when there is none."""
+        if self._running is None or not self._running[1].done():
+            return None
+        window, job = self._running
+        motion = close_window(world, window, job.result())
+        self._running, waiting = None, self._waiting
+        self._waiting = None
+        if waiting is not None:
+            self.start(world, waiting)
+        return motion
+
+    def finish(self, world: Map) -> None:
+        """Wait for what is under way and what waits, and put it into the map."""
+        while self._running is not None:
+            self._running[1].result()
+            self.collect(world)
+
+
+@contextmanager
+def worker_process() -> Iterator[Executor]:
+    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as executor:
+        executor.submit(_begin).result()
+        yield executor
+
+
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
+    threadpool_limits(1, "blas")
+    if hasattr(os, "nice"):
+        os.nice(NICE)

@@ -1,0 +1,64 @@
+"""Every tracked frame, by where it lies from a keyframe: keyframes move later on, and take it along."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.pose import Array, inverse
+from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
+from cohdc_train.slam.tracking.localizer import Fit
+
+
+class _Logged(NamedTuple):
+    """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in it, m; information,
+    pull: as those of `Fit`."""
+
+    t: float
+    reference: int
+    relative: Array
+    information: Array
+    pull: Array
+
+
+class FrameLog:
+    """The frames of one run, in their order."""
+
+    def __init__(self) -> None:
+        self._frames: list[_Logged] = []
+
+    def append(self, t: float, fit: Fit, world: Map) -> int:
+        """The frame at t, s, after those before it. Returns its row."""
+        assert fit.reference is not None
+        index = fit.reference.index
+        relative = fit.T_cw @ inverse(world.pose(index))
+        self._frames.append(_Logged(t, index, relative, fit.information, fit.pull))
+        return len(self._frames) - 1
+
+    @property
+    def stamps(self) -> Array:
+        """[n] s."""
+        return np.array([frame.t for frame in self._frames])
+
+    def poses(self, world: Map) -> Array:
+        """[n, 4, 4] T_cw world to camera, m: each frame re-derived from its reference keyframe, or that one's heir, as
+        the map has it now."""
+        references = [frame.reference for frame in self._frames]
+        keyframes = {index: world.pose(index) for index in set(references)}
+        poses = [frame.relative @ keyframes[frame.reference] for frame in self._frames]
+        return np.stack(poses) if poses else np.zeros((0, 4, 4))
+
+    def put(self, world: Map, rows: Sequence[int], poses: Array) -> None:
+        """The frames in rows [m] are at poses [m, 4, 4] T_cw, m, in the map as it is now."""
+        for row, pose in zip(rows, poses, strict=True):
+            frame = self._frames[row]
+            self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
+
+    def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
+        """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has them now."""
+        stamps, poses = self.stamps, self.poses(world)
+        if smooth and len(poses):
+            information = np.stack([frame.information for frame in self._frames])
+            poses = smoothed(stamps, poses, information, np.stack([frame.pull for frame in self._frames]))
+        return stamps, inverse(poses)

@@ -1,0 +1,87 @@
+"""The adjustment when a sequence is over: all keyframes, and what frames between them saw.
+
+A keyframe every half second is what mapping has time for on the way. The frames between have seen every point ten times
+more often.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.features.matching import Matches
+from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.mapping.frame_history import FrameLog
+from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, adjust_everything
+from cohdc_train.slam.mapping.map import Map, observations
+from cohdc_train.slam.optimization.pose import Array, Observations, Weighing
+from cohdc_train.slam.tracking.localizer import Fit
+from cohdc_train.slam.tracking.motion_model import FEW
+
+_MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
+_TURNS = 2  # a matched frame gives only every second of its points, another one the others: a quarter of the time
+
+
+class _Kept(NamedTuple):
+    """row: of the frame in the log; ids: [m] points that it saw; born: [m] keyframe index of each, for a younger point
+    may take the row of one that is gone; seen: the m measurements."""
+
+    row: int
+    ids: NDArray[np.int64]
+    born: NDArray[np.int64]
+    seen: Observations
+
+
+class SeenFrames:
+    """Frames by what they saw of the map, evenly thinned: so many are kept that memory is bounded."""
+
+    def __init__(self) -> None:
+        self._kept: list[_Kept] = []
+        self._every = 1
+        self._count = 0
+
+    def chosen(self, fit: Fit, matched: bool) -> Matches | None:
+        """What is wanted of the next settled frame, if anything; matched: against the map, so that it saw all it can.
+
+        One that saw little is not kept: what it gives would not do for a pose.
+        """
+        turns = _TURNS if matched else 1
+        if len(fit.matches) < turns * FEW:
+            return None
+        number, self._count = self._count, self._count + 1
+        if number % self._every:
+            return None
+        turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
+        return fit.matches.take((fit.matches.points + turn) % turns == 0)
+
+    def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
+        """What was chosen of the frame in a row of the log, after those before it, and its corners."""
+        ids, seen = matches.points, observations(features, matches.corners)
+        self._kept.append(_Kept(row, ids, world.born[ids], seen))
+        if len(self._kept) > _MOST:
+            self._kept = self._kept[::2]
+            self._every *= 2
+
+    def adjust(self, world: Map, weighing: Weighing, log: FrameLog) -> None:
+        """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are moved in the log;
+        others stay where they lie from their reference keyframes.
+
+        Without the first step a map that loops have moved is still too far off when the few of the second are over.
+        """
+        adjust_everything(world, weighing)
+        stamps, keyframes = log.stamps, {keyframe.t for keyframe in world.keyframes}
+        others = [kept for kept in self._kept if stamps[kept.row] not in keyframes]
+        if not others:
+            return
+        poses = log.poses(world)
+        sightings = [_sighting(kept, poses[kept.row], world) for kept in others]
+        log.put(world, [kept.row for kept in others], adjust_everything(world, weighing, sightings))
+
+
+def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
+    """What a frame saw of points that are still there."""
+    same = np.flatnonzero(world.born[kept.ids] == kept.born)
+    ids = world.current(kept.ids[same])
+    there = np.flatnonzero(world.seen_by[ids] > 0)
+    ids, first = np.unique(ids[there], return_index=True)
+    return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))

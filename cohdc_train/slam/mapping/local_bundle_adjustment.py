@@ -1,0 +1,127 @@
+"""Bundle adjustment of keyframes, near the newest or all, in three steps: arrays out, the sums, the result back in.
+
+The middle step touches no map, so it may run elsewhere and later (`background_mapping`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.mapping.map import Keyframe, Map, observations
+from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, measurement_chi2
+from cohdc_train.slam.optimization.pose import Array, Observations, Weighing, inverse, joined, to_local
+
+WINDOW = 12  # keyframes in local bundle adjustment
+FIXED = 3  # of them hold still and carry the frame of reference
+
+
+@dataclass(frozen=True)
+class Window:
+    """What a bundle adjustment starts from.
+
+    keyframes: [k] the newest last; poses: [c, 4, 4] T_cw, m, as they were, of the keyframes and then of c - k other
+    frames; ids: [p] map points; points: [p, 3] world, m, as they were; problem: m measurements; corners: [m] the
+    keyframe's corner behind each, or the other frame's row.
+    """
+
+    keyframes: list[Keyframe]
+    poses: list[Array]
+    ids: NDArray[np.int64]
+    points: Array
+    problem: Problem
+    corners: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What a frame that is no keyframe saw. T_cw: [4, 4] world to camera, m; ids: [m] map points, none of them twice;
+    seen: the m measurements, as of points that surely stand still."""
+
+    T_cw: Array
+    ids: NDArray[np.int64]
+    seen: Observations
+
+
+@dataclass(frozen=True)
+class Solution:
+    """poses: [c, 4, 4] T_cw, m; points: [p, 3] world, m; good: [m] bool, measurements that fit."""
+
+    poses: Array
+    points: Array
+    good: NDArray[np.bool_]
+
+
+def open_window(world: Map, keyframe: Keyframe) -> Window:
+    """The keyframe with those that share most points, and their measurements."""
+    keyframes = world.covisible(keyframe.seen_points(), WINDOW)
+    keyframes.sort(key=lambda k: k.index)
+    return _window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
+
+
+def adjust_everything(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> Array:
+    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first keyframe holds
+    still. Returns [s, 4, 4] T_cw of those frames, m."""
+    window = _window(world, list(world.keyframes), 1, sightings)
+    solution = solve(np.stack(window.poses), window.points, window.problem, weighing)
+    close_window(world, window, solution)
+    return solution.poses[len(window.keyframes) :]
+
+
+def _window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()) -> Window:
+    """Keyframes, the newest last, of which the first few are fixed, with all measurements of the others' points."""
+    ids = world.points_of(keyframes[fixed:])
+    row = np.full(world.size + 1, -1)
+    row[ids] = np.arange(len(ids))
+    named = [k.point_ids for k in keyframes] + [s.ids for s in sightings]
+    corners = [np.flatnonzero(row[points] >= 0) for points in named]
+    points = [row[all_of_them[c]] for all_of_them, c in zip(named, corners, strict=True)]
+    seen = [observations(k.features, c) for k, c in zip(keyframes, corners, strict=False)]
+    seen += [s.seen.take(c) for s, c in zip(sightings, corners[len(keyframes) :], strict=True)]
+    rows = np.concatenate(points)
+    problem = Problem(
+        cameras=np.repeat(np.arange(len(corners)), [len(c) for c in corners]),
+        points=rows,
+        seen=joined(seen).trusted(world.trust(ids)[rows]),
+        free=np.arange(len(corners)) >= fixed,
+    )
+    poses = [k.T_cw for k in keyframes] + [s.T_cw for s in sightings]
+    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(corners))
+
+
+def solve(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Solution:
+    """Robustly first, then once more without the measurements that do not fit. Arrays as in `Window`."""
+    poses, points = adjust(poses, points, problem, weighing, steps=5)
+    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
+    poses, points = adjust(poses, points, problem.take(good), weighing, steps=3, robust=False)
+    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
+    return Solution(poses, points, good)
+
+
+def close_window(world: Map, window: Window, solution: Solution) -> Array | None:
+    """Put a solution into the map; measurements that do not fit are dropped.
+
+    The map may have changed since the window was opened: what was added moves along with the window's newest keyframe.
+    No keyframe of the window may have been removed.
+    Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and nothing is done, when
+    somebody else moved one of the keyframes in the meantime (a loop was closed).
+    """
+    if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=False)):
+        return None
+    last = len(window.keyframes) - 1
+    motion: Array = inverse(window.poses[last]) @ solution.poses[last]
+    newest = window.keyframes[last].index
+    for keyframe in world.keyframes:
+        if keyframe.index > newest:
+            keyframe.T_cw = keyframe.T_cw @ motion
+    added = np.flatnonzero(world.born[: world.size] > newest)
+    world.positions[added] = to_local(inverse(motion), world.positions[added])
+    same = world.born[window.ids] <= newest  # a younger point may have taken the row of one that is gone
+    world.positions[window.ids[same]] = solution.points[same]
+    for slot, member in enumerate(window.keyframes):
+        member.T_cw = solution.poses[slot]
+        rows = (window.problem.cameras == slot) & ~solution.good
+        corners, ids = window.corners[rows], window.ids[window.problem.points[rows]]
+        world.forget(member, corners[member.point_ids[corners] == ids])
+    return motion

@@ -1,0 +1,106 @@
+"""All that follows when a keyframe joins the map: at once, or a part per frame where time is short."""
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor
+
+from cohdc_train.slam.config import Method
+from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
+from cohdc_train.slam.mapping.background_bundle_adjustment import BackgroundMapper
+from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
+from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.mapping.map_points import add_points, adjust_window, cull, fuse
+from cohdc_train.slam.mapping.patch_refiner import Refiner
+from cohdc_train.slam.optimization.image_alignment import Picture
+from cohdc_train.slam.optimization.pose import Weighing
+
+
+class LocalMapping:
+    """Takes keyframes into a map and puts it in order.
+
+    refiner: cuts out the patches of new points; executor: where bundle adjustment runs, beside tracking
+    (`background_mapping`), without one it is waited for; in_parts: what can wait is done by `work`, a part at a time.
+    """
+
+    def __init__(
+        self,
+        world: Map,
+        weighing: Weighing,
+        method: Method,
+        refiner: Refiner | None,
+        seed: int,
+        executor: Executor | None,
+        in_parts: bool,
+    ) -> None:
+        self._world, self._weighing = world, weighing
+        self._mapper = None if executor is None else BackgroundMapper(executor, weighing)
+        self._refiner = refiner
+        self._loops = LoopCloser(world, weighing, seed) if method.loops else None
+        self._culls_keyframes = method.keyframe_culling
+        self._in_parts = in_parts
+        self._parts: deque[Callable[[], None]] = deque()
+
+    @property
+    def loops(self) -> int:
+        """How many loops were closed."""
+        return 0 if self._loops is None else self._loops.closed
+
+    @property
+    def busy(self) -> bool:
+        """Whether something is left to do of the latest keyframe."""
+        return bool(self._parts)
+
+    def insert(self, keyframe: Keyframe, picture: Callable[[], Picture]) -> None:
+        """A tracked keyframe joins, and its corners of known depth become points. Then: duplicates merged, bundle
+        adjustment, weak points out; loops, superfluous keyframes out.
+
+        picture: makes what loop closing keeps of it. Must not be called while `busy`.
+        """
+        assert not self.busy
+        self._world.add_keyframe(keyframe)
+        add_points(self._world, keyframe)
+        if self._refiner is not None:
+            self._refiner.remember(keyframe)
+        self._parts.extend([lambda: self._settle(keyframe), lambda: self._look_back(keyframe, picture)])
+        if not self._in_parts:
+            self._finish_parts()
+
+    def work(self) -> None:
+        """One part of what is left, if anything. Keyframes may move."""
+        if self._parts:
+            self._parts.popleft()()
+
+    def collect(self) -> None:
+        """What was adjusted beside tracking goes into the map. Keyframes may move."""
+        if self._mapper is not None:
+            self._mapper.collect(self._world)
+
+    def finish(self) -> None:
+        """Do all that is left."""
+        self._finish_parts()
+        if self._mapper is not None:
+            self._mapper.finish(self._world)
+
+    def _finish_parts(self) -> None:
+        while self._parts:
+            self.work()
+
+    def _settle(self, keyframe: Keyframe) -> None:
+        if len(self._world.keyframes) == 1:
+            return
+        fuse(self._world, keyframe)
+        if self._mapper is None:
+            adjust_window(self._world, keyframe, self._weighing)
+        else:
+            self._mapper.start(self._world, keyframe)
+        cull(self._world, keyframe.index)
+
+    def _look_back(self, keyframe: Keyframe, picture: Callable[[], Picture]) -> None:
+        in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
+        if self._loops is not None:
+            self._loops.close(keyframe, picture())
+            in_use = in_use | self._loops.ends
+        if self._culls_keyframes:
+            for removed in cull_keyframes(self._world, keyframe, in_use):
+                if self._loops is not None:
+                    self._loops.forget(removed)

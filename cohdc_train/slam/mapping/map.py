@@ -1,0 +1,276 @@
+"""The map: points, keyframes, and which keyframe sees which point."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.features.matching import Matches, Projected
+from cohdc_train.slam.features.orb import LEVELS, SCALE, Features
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.optimization.pose import Array, Observations, inverse, to_local
+
+_NEAR = 0.1  # m
+_OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
+_NEIGHBOURS = 64  # keyframes that are looked at when those that share most points are sought
+_STILL = 3.0  # log-odds that a new point stands still
+_WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
+_VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A frame the map keeps.
+
+    index: its number, Map.joined when it joins, not used again; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n]
+    int64, the map point of every corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the
+    place again; nearest: [h, w] coarse depth as Geometry.nearest gives it, m.
+    """
+
+    index: int
+    t: float
+    T_cw: Array
+    features: Features
+    point_ids: NDArray[np.int64]
+    thumbnail: NDArray[np.float32]
+    nearest: NDArray[np.float32]
+
+    def seen_points(self) -> NDArray[np.int64]:
+        """Ids of the points this keyframe sees."""
+        return self.point_ids[self.point_ids >= 0]
+
+    def centre(self) -> Array:
+        """[3] position of the camera in the world, m."""
+        return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
+
+
+def observations(features: Features, corners: NDArray[np.int64]) -> Observations:
+    """What a frame measured at some of its corners."""
+    sigmas, depth_sigmas = features.sigmas[corners], features.scales[corners]
+    return Observations(features.points[corners], features.depths[corners], sigmas, depth_sigmas)
+
+
+class Map:
+    """Points live in arrays that grow by doubling; an id is a row, which a new point takes when no keyframe sees the
+    one in it any more.
+
+    keyframes: those that are in the map, index rising; joined: how many ever were.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self.keyframes: list[Keyframe] = []
+        self.joined = 0
+        self._by_index: dict[int, Keyframe] = {}
+        self._heirs: dict[int, tuple[int, Array]] = {}  # of removed keyframes: whom each hangs on, and by what
+        self.size = 0
+        self.positions = np.zeros((1024, 3))
+        self.descriptors = np.zeros((1024, 4), dtype=np.uint64)
+        self.directions = np.zeros((1024, 3))  # sum of unit vectors from camera centres to the point
+        self.reach = np.zeros(1024)  # m: from further away not even the finest level shows the point
+        self.seen_by = np.zeros(1024, dtype=np.int64)  # keyframes
+        self.observers = np.zeros((1024, _OBSERVERS), dtype=np.int32)  # keyframe index + 1, 0 = none, in any order
+        self.born = np.zeros(1024, dtype=np.int64)  # keyframe index
+        self.became = np.full(1024, -1)  # the point that took over the one in this row
+        self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
+        self.found = np.zeros(1024, dtype=np.int64)  # frames that did
+        self.moved = np.zeros(1024)  # log-odds against standing still, beyond those of a new point
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
+        self.keyframes.append(keyframe)
+        self._by_index[keyframe.index] = keyframe
+        self.joined = keyframe.index + 1
+        self._add_observer(keyframe.seen_points(), keyframe)
+
+    def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:
+        """Take out a keyframe; what hung on it, frames and points, hangs on another from now on, where it is now.
+
+        The directions its points were seen from stay known.
+        """
+        self.forget(keyframe, np.flatnonzero(keyframe.point_ids >= 0))
+        self.keyframes.remove(keyframe)
+        del self._by_index[keyframe.index]
+        self._heirs[keyframe.index] = heir.index, keyframe.T_cw @ inverse(heir.T_cw)
+
+    def anchor(self, index: int) -> tuple[Keyframe, Array]:
+        """What a keyframe that joined once hangs on: itself, or the heir of a removed one; and [4, 4] from the heir's
+        camera to its own, m."""
+        T = np.eye(4)
+        while index not in self._by_index:
+            index, step = self._heirs[index]
+            T = T @ step
+        return self._by_index[index], T
+
+    def pose(self, index: int) -> Array:
+        """T_cw [4, 4], m, of a keyframe that joined once."""
+        keyframe, T = self.anchor(index)
+        return np.asarray(T @ keyframe.T_cw)
+
+    def way(self) -> Array:
+        """[joined, 4, 4] T_wc, m, of all keyframes, removed ones too."""
+        return inverse(np.stack([self.pose(index) for index in range(self.joined)]))
+
+    def add_points(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
+        """New points at the depth that was measured at corners of a keyframe."""
+        features, count = keyframe.features, len(corners)
+        ids = self._free_rows(count)
+        local = self.camera.backproject(features.points[corners], features.depths[corners])
+        self.positions[ids] = (local - keyframe.T_cw[:3, 3]) @ keyframe.T_cw[:3, :3]
+        self.descriptors[ids] = features.descriptors[corners]
+        self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[corners]
+        self.born[ids] = keyframe.index
+        self.became[ids] = -1
+        self.directions[ids] = 0.0
+        self.moved[ids] = 0.0
+        self.visible[ids] = self.found[ids] = 1
+        self.observe(keyframe, Matches(ids, corners))
+
+    def observe(self, keyframe: Keyframe, matches: Matches) -> None:
+        """Corners of a keyframe, free so far, are measurements of points, held against none of their patches."""
+        keyframe.point_ids[matches.corners] = matches.points
+        keyframe.features.precise[matches.corners] = False
+        self._add_observer(matches.points, keyframe)
+
+    def forget(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
+        """Corners of a keyframe are no measurements of their points."""
+        ids = keyframe.point_ids[corners]
+        np.subtract.at(self.seen_by, ids, 1)
+        self.observers[ids] = np.where(self.observers[ids] == keyframe.index + 1, 0, self.observers[ids])
+        keyframe.point_ids[corners] = -1
+
+    def replace(self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
+        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point.
+
+        The log-odds of having moved become the larger of both: the same frames have judged them, so that their sum
+        would count what a group did twice.
+        """
+        np.maximum.at(self.moved, new, self.moved[old])
+        self.became[old] = new
+        alias = np.arange(self.size + 1)
+        alias[old] = new
+        alias[-1] = -1
+        for keyframe in keyframes:
+            ids = alias[keyframe.point_ids]
+            changed = np.flatnonzero(ids != keyframe.point_ids)
+            if len(changed) == 0:
+                continue
+            self.forget(keyframe, changed)
+            heirs = ids[changed]
+            corner = np.full(self.size + 1, -1)  # that an heir gets, the first of several
+            corner[heirs[::-1]] = changed[::-1]
+            corner[keyframe.point_ids] = -1  # it has one
+            keep = corner[heirs] == changed
+            self.observe(keyframe, Matches(heirs[keep], changed[keep]))
+
+    def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[n] what the points `ids` have become, by however many steps: themselves where none took them over."""
+        while True:
+            heirs = self.became[ids]
+            taken = (heirs >= 0) & (self.born[heirs] <= self.born[ids])  # else a new point has the heir's row
+            if not taken.any():
+                return ids
+            ids = np.where(taken, heirs, ids)
+
+    def trust(self, ids: NDArray[np.int64]) -> Array:
+        """[n] probability that each point stands still, as a share of a new point's: its weight, above 0 up to 1."""
+        return np.asarray((1 + np.exp(-_STILL)) / (1 + np.exp(self.moved[ids] - _STILL)))
+
+    def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
+        """Where the map has the matched points, [m, 3] m, and what a frame measured of them."""
+        seen = observations(features, matches.corners).trusted(self.trust(matches.points))
+        return self.positions[matches.points], seen
+
+    def judge(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
+        """A frame has seen points stand still, and others move with a group that does not."""
+        self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)
+        self.moved[moving] = np.minimum(self.moved[moving] + _WENT, _CERTAIN)
+
+    def shared(self, ids: NDArray[np.int64], keyframes: list[Keyframe]) -> NDArray[np.int64]:
+        """[keyframes] how many of the points each of them sees."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        flags[ids] = True
+        return np.array([np.count_nonzero(flags[k.point_ids]) for k in keyframes], dtype=np.int64)
+
+    def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
+        """Keyframes that see at least one of the points, those that see most first.
+
+        Only the 64 that occur most often among the points' observers are looked at, so that the time this takes
+        does not grow with the map.
+        """
+        often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
+        near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBOURS])
+        keyframes = [self._by_index[i] for i in near.tolist() if often[i] > 0]
+        shared = self.shared(ids, keyframes)
+        order = np.argsort(-shared, kind="stable")[:limit]
+        return [keyframes[i] for i in order if shared[i] > 0]
+
+    def observers_of(self, ids: NDArray[np.int64]) -> list[Keyframe]:
+        """The keyframes that see at least one of the points, of those that each point remembers."""
+        return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
+
+    def move(self, poses: Array) -> None:
+        """Keyframes go to poses [keyframes, 4, 4] T_cw, m, and every point goes along with the one it was born in."""
+        motions = inverse(poses) @ np.stack([k.T_cw for k in self.keyframes])
+        row = {keyframe.index: i for i, keyframe in enumerate(self.keyframes)}
+        born, which = np.unique(self.born[: self.size], return_inverse=True)
+        motion = motions[[row[self.anchor(index)[0].index] for index in born.tolist()]][which]
+        for keyframe, T_cw in zip(self.keyframes, poses, strict=True):
+            keyframe.T_cw = T_cw
+        moved = np.einsum("nij,nj->ni", motion[:, :3, :3], self.positions[: self.size])
+        self.positions[: self.size] = moved + motion[:, :3, 3]
+        self.directions[: self.size] = np.einsum("nij,nj->ni", motion[:, :3, :3], self.directions[: self.size])
+
+    def points_of(self, keyframes: list[Keyframe]) -> NDArray[np.int64]:
+        """Ids of the points that any of the keyframes sees, rising."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        for keyframe in keyframes:
+            flags[keyframe.point_ids] = True
+        return np.flatnonzero(flags[:-1])
+
+    def unseen(self, ids: NDArray[np.int64], keyframe: Keyframe) -> NDArray[np.int64]:
+        """Those of the points that a keyframe does not see, rising, each once."""
+        flags = np.zeros(self.size + 1, dtype=np.bool_)
+        flags[ids] = True
+        flags[keyframe.point_ids] = False
+        return np.flatnonzero(flags[:-1])
+
+    def project(self, ids: NDArray[np.int64], T_cw: Array) -> Projected:
+        """The points among `ids` that a camera at T_cw should see."""
+        camera, local = self.camera, to_local(T_cw, self.positions[ids])
+        z = np.maximum(local[:, 2], _NEAR)
+        u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
+        inside = (local[:, 2] > _NEAR) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        ids, local = ids[inside], local[inside]
+        distance = np.sqrt(np.einsum("nj,nj->n", local, local))
+        sums = self.directions[ids]
+        along = np.einsum("nj,nj->n", local @ T_cw[:3, :3], sums)  # cosine times distance times length of the sum
+        level = np.log(np.maximum(self.reach[ids], 1e-9) / distance) / np.log(SCALE)
+        seen = along > _VIEW_COSINE * distance * np.sqrt(np.einsum("nj,nj->n", sums, sums))
+        seen &= (level > -1.0) & (level < LEVELS)
+        levels = np.clip(np.rint(level[seen]), 0, LEVELS - 1).astype(np.int64)
+        pixels = np.stack([u[inside][seen], v[inside][seen]], axis=1)
+        return Projected(ids[seen], pixels, levels, self.descriptors[ids[seen]])
+
+    def _add_observer(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
+        self.observers[ids, self.observers[ids].argmin(axis=1)] = keyframe.index + 1  # a free place, or the oldest's
+        self.seen_by[ids] += 1
+        offset = self.positions[ids] - keyframe.centre()
+        self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
+
+    def _free_rows(self, count: int) -> NDArray[np.int64]:
+        """Rows that hold no point, those of former points first."""
+        free = np.flatnonzero(self.seen_by[: self.size] == 0)[:count]
+        end = self.size + count - len(free)
+        ids = np.concatenate([free, np.arange(self.size, end)])
+        self._reserve(end)
+        self.size = end
+        return ids
+
+    def _reserve(self, count: int) -> None:
+        counters = ("seen_by", "observers", "born", "became", "visible", "found", "moved")
+        names = ("positions", "descriptors", "directions", "reach", *counters)
+        while len(self.positions) < count:
+            for name in names:
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))

@@ -1,0 +1,84 @@
+"""What a keyframe that joins brings: new points, duplicates merged, local bundle adjustment, weak points out."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.features.matching import match_projected
+from cohdc_train.slam.mapping.local_bundle_adjustment import close_window, open_window, solve
+from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.optimization.pose import Weighing
+
+_FUSE_KEYFRAMES = 8
+_TRIAL = 3  # keyframes after which a point must have proved itself
+MIN_SEEN_BY = 2  # keyframes that must see a point, as ORB-SLAM2 has it where depth is measured
+_MIN_FOUND = 0.25
+
+
+def add_points(world: Map, keyframe: Keyframe) -> None:
+    """A point for every corner with depth that belongs to none."""
+    features = keyframe.features
+    usable = (keyframe.point_ids < 0) & (features.depths <= world.camera.far)  # nan compares False
+    world.add_points(keyframe, np.flatnonzero(usable))
+
+
+def fuse(world: Map, keyframe: Keyframe) -> None:
+    """Look for the keyframe's points in its neighbours: more measurements; duplicates become the older point."""
+    ids = keyframe.seen_points()
+    neighbours = [k for k in world.covisible(ids, _FUSE_KEYFRAMES + 1) if k is not keyframe]
+    pairs = [_look_for(world, ids, other) for other in neighbours]
+    if pairs:
+        _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbours])
+
+
+def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]) -> None:
+    """Look for points in one keyframe that may not know them yet; `keyframes` are all that may hold duplicates."""
+    _merge(world, _look_for(world, ids, other), keyframes)
+
+
+def _look_for(world: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np.int64]:
+    """Look for points in one keyframe, where they become measurements of corners that belong to none.
+
+    Returns [2, k] such points, and those that their corners belong to.
+    """
+    projected = world.project(world.unseen(ids, other), other.T_cw)
+    matches = match_projected(projected, other.features, radius=3.0, max_distance=60)
+    current = other.point_ids[matches.corners]
+    world.observe(other, matches.take(current < 0))
+    return np.stack([matches.points, current])[:, current >= 0]
+
+
+def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
+    """Of pairs [2, k] of points that look alike, those that are near each other become one."""
+    near = np.linalg.norm(world.positions[pairs[0]] - world.positions[pairs[1]], axis=1) < 0.05
+    first, second = pairs[:, near]
+    if len(first) == 0:
+        return
+    later = world.born[first] - world.born[second]
+    older = np.where(later == 0, first < second, later < 0)  # one order of all points, so that no two swap places
+    old, new = np.where(older, second, first), np.where(older, first, second)
+    gives_way = np.zeros(world.size, dtype=np.bool_)
+    gives_way[old] = True
+    stays = ~gives_way[new]  # a point that itself gives way this time waits for the next keyframe
+    world.replace(old[stays], new[stays], keyframes)
+
+
+def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
+    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not fit are dropped."""
+    window = open_window(world, keyframe)
+    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))
+
+
+def cull(world: Map, newest: int) -> None:
+    """Drop young points that few keyframes confirmed or that frames rarely found where they should be."""
+    young = np.flatnonzero((world.born[: world.size] >= newest - _TRIAL) & (world.seen_by[: world.size] > 0))
+    weak = (world.born[young] == newest - _TRIAL) & (world.seen_by[young] < MIN_SEEN_BY)
+    weak |= world.found[young] < _MIN_FOUND * world.visible[young]
+    drop_points(world, young[weak])
+
+
+def drop_points(world: Map, ids: NDArray[np.int64]) -> None:
+    """No keyframe sees these points any more."""
+    drop = np.zeros(world.size + 1, dtype=np.bool_)
+    drop[ids] = True
+    for keyframe in world.observers_of(ids):
+        world.forget(keyframe, np.flatnonzero(drop[keyframe.point_ids]))

@@ -1,0 +1,155 @@
+"""Bundle adjustment: Levenberg-Marquardt over poses and points, points eliminated by the Schur complement."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from cohdc_train.slam.optimization.pose import (
+    Array,
+    Observations,
+    Weighing,
+    exp_se3,
+    huber_weights,
+    pose_jacobian,
+    residual_jacobian,
+    residuals,
+    solve_symmetric,
+    to_local,
+)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Which camera saw which point. No camera sees a point twice.
+
+    cameras: [m] int64 index into the poses, sorted; points: [m] int64 index into the points; seen: the m measurements;
+    free: [c] bool, which poses may move.
+    """
+
+    cameras: NDArray[np.int64]
+    points: NDArray[np.int64]
+    seen: Observations
+    free: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        if not len(self.cameras) == len(self.points) == len(self.seen):
+            raise ValueError("cameras, points and measurements differ in length")
+        if np.any(np.diff(self.cameras) < 0):
+            raise ValueError("measurements must be sorted by camera")
+
+    def take(self, rows: NDArray[np.bool_]) -> "Problem":
+        """The same problem with the chosen measurements only."""
+        return Problem(self.cameras[rows], self.points[rows], self.seen.take(rows), self.free)
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Blocks of the normal equations of c free cameras and p points, after weighing."""
+
+    camera: Array  # [c, 6, 6]
+    point: Array  # [p, 3, 3]
+    mixed: sparse.bsr_array  # [c * 6, p * 3]: a block of 6 x 3 for every measurement by a free camera
+    camera_gradient: Array  # [c, 6]
+    point_gradient: Array  # [p, 3]
+
+
+def local_points(poses: Array, points: Array, problem: Problem) -> Array:
+    """[m, 3] each measured point in the frame of the camera that saw it, m."""
+    result = np.empty((len(problem.points), 3))
+    ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
+    for camera, pose in enumerate(poses):
+        rows = slice(ends[camera], ends[camera + 1])
+        result[rows] = to_local(pose, points[problem.points[rows]])
+    return result
+
+
+def measurement_chi2(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Array:
+    """[m] squared residual in sigmas; infinite where the point lies behind the camera."""
+    local = local_points(poses, points, problem)
+    error = residuals(local, problem.seen, weighing)
+    return np.where(local[:, 2] > 0.05, np.einsum("mi,mi->m", error, error), np.inf)
+
+
+def adjust(
+    poses: Array, points: Array, problem: Problem, weighing: Weighing, steps: int = 8, robust: bool = True
+) -> tuple[Array, Array]:
+    """Minimise the (Huber) cost of all measurements over the free poses and all points.
+
+    poses: [c, 4, 4] T_cw; points: [p, 3] world, m. Returns both, improved; the cost never rises. At least one pose
+    must be fixed, or depth measured, for the problem to have one answer; damping keeps the step finite in any case.
+    """
+    damping = 1e-4
+    cost = _cost(poses, points, problem, weighing, robust)
+    for _ in range(steps):
+        normal = _normal_equations(poses, points, problem, weighing, robust)
+        pose_step, point_step = _solve(normal, damping)
+        new_poses = poses.copy()
+        new_poses[problem.free] = exp_se3(pose_step) @ poses[problem.free]
+        new_points = points + point_step
+        new_cost = _cost(new_poses, new_points, problem, weighing, robust)
+        if new_cost > cost:
+            damping *= 10
+            continue
+        gain = (cost - new_cost) / max(cost, 1e-12)
+        poses, points, cost, damping = new_poses, new_points, new_cost, max(damping / 10, 1e-8)
+        if gain < 1e-3:
+            break
+    return poses, points
+
+
+def _cost(poses: Array, points: Array, problem: Problem, weighing: Weighing, robust: bool) -> float:
+    error = residuals(local_points(poses, points, problem), problem.seen, weighing)
+    chi2 = np.einsum("mi,mi->m", error, error)
+    if not robust:
+        return float(chi2.sum())
+    limits = problem.seen.limits
+    return float(np.where(chi2 <= limits, chi2, 2 * np.sqrt(limits * chi2) - limits).sum())
+
+
+def _normal_equations(poses: Array, points: Array, problem: Problem, weighing: Weighing, robust: bool) -> _Normal:
+    local = local_points(poses, points, problem)
+    error = residuals(local, problem.seen, weighing)
+    derivative = residual_jacobian(local, problem.seen, weighing)
+    if robust:
+        weight = np.sqrt(huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.limits))
+        error, derivative = error * weight[:, None], derivative * weight[:, None, None]
+    by_pose = pose_jacobian(local, derivative)
+    by_point = derivative @ poses[problem.cameras, :3, :3]
+    free, count = np.flatnonzero(problem.free), len(points)
+    camera, camera_gradient = np.zeros((len(free), 6, 6)), np.zeros((len(free), 6))
+    point, point_gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
+    for rows in (slice(*pair) for pair in pairwise(ends)):
+        ids, J = problem.points[rows], by_point[rows]  # a camera sees a point once, so += may index with an array
+        point[ids] += J.transpose(0, 2, 1) @ J
+        point_gradient[ids] += np.einsum("mij,mi->mj", J, error[rows])
+    for slot, index in enumerate(free):
+        rows = slice(ends[index], ends[index + 1])
+        J = by_pose[rows].reshape(-1, 6)
+        camera[slot] = J.T @ J
+        camera_gradient[slot] = J.T @ error[rows].reshape(-1)
+    moves = problem.free[problem.cameras]
+    blocks = by_pose[moves].transpose(0, 2, 1) @ by_point[moves]
+    lengths = np.concatenate([[0], np.cumsum(np.diff(ends)[free])])
+    mixed = sparse.bsr_array((blocks, problem.points[moves], lengths), shape=(6 * len(free), 3 * count))
+    return _Normal(camera, point, mixed, camera_gradient, point_gradient)
+
+
+def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
+    """Steps of the poses [c, 6] and the points [p, 3] from the damped normal equations."""
+    c, mixed = len(normal.camera), normal.mixed
+    diagonal = np.arange(3)
+    point = normal.point.copy()
+    point[:, diagonal, diagonal] = point[:, diagonal, diagonal] * (1 + damping) + 1e-6
+    inverse = np.linalg.inv(point)
+    blocks = mixed.data @ inverse[mixed.indices]
+    carried = sparse.bsr_array((blocks, mixed.indices, mixed.indptr), shape=mixed.shape)
+    camera = normal.camera + (damping * normal.camera + 1e-9) * np.eye(6)
+    cameras = sparse.bsr_array((camera, np.arange(c), np.arange(c + 1)))
+    right = carried @ normal.point_gradient.ravel() - normal.camera_gradient.ravel()
+    pose_step = solve_symmetric(cameras - carried @ mixed.T, right)
+    back = -normal.point_gradient - (mixed.T @ pose_step).reshape(-1, 3)
+    return pose_step.reshape(c, 6), np.einsum("pij,pj->pi", inverse, back)

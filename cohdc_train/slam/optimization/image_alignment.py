@@ -1,0 +1,194 @@
+"""Inverse compositional alignment of a local picture to the map's (paper section 2.3, equations 10 to 12).
+
+Where this departs from the paper:
+- its warp is a euclidean motion (x, y, theta) of whole map images. Pictures of a room have parallax, so that such a
+  motion has no metric meaning; here the warp W(x; p) carries a pixel x of the map's picture, through its measured
+  depth, by a rigid motion p of six parameters into the local picture;
+- equation 11 squares the residual and leaves out the transpose: misprints, for a squared residual has no sign. The step
+  of Gauss-Newton is H^-1 times the sum of steepest-descent^T times the residual;
+- equation 12 adds the step to p; motions do not add, so W is composed with the inverse of the step.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.geometry.camera import Camera, maps_onto
+from cohdc_train.slam.optimization.pose import Array, exp_se3, inverse, to_local
+
+_SIDE = 160  # px of a picture's longer side
+_LEVELS = 2
+_STEPS = 20
+_EDGE = 0.05  # of the depth: a larger step between neighbours is an edge, whose pixels have no sure depth
+_SAME_DEPTH = 0.07  # of the depth: what lies further off is another surface
+_CLIP = 1.5  # robust sigmas
+_FEWEST = 200  # px that must be seen in both pictures
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a keyframe keeps to be aligned.
+
+    gray: [h, w] float32; depth: [h, w] float32 m, 0 = none or dynamic; camera: the picture's own, without distortion.
+    """
+
+    gray: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    camera: Camera
+
+    def half(self) -> "Picture":
+        """Half as wide and high."""
+        c = self.camera
+        gray = _float32(cv2.pyrDown(self.gray))
+        height, width = gray.shape
+        camera = Camera(c.fx / 2, c.fy / 2, c.cx / 2, c.cy / 2, width, height, c.depth_scale)
+        return Picture(gray, self.depth[::2, ::2].copy(), camera)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How two pictures fit.
+
+    T: [4, 4] camera of the map's picture to camera of the local one, m; before, after: mean clipped photometric error,
+    in standard deviations of the map's picture; correlation: -1..1 of the two pictures where both see the same;
+    overlap: share of the map's pixels that the local picture sees at the depth they should have; agreement: the same
+    share of those pixels that fall on a depth reading at all.
+    """
+
+    T: Array
+    before: float
+    after: float
+    correlation: float
+    overlap: float
+    agreement: float
+
+
+def take_picture(
+    rgb: NDArray[np.uint8], depth: NDArray[np.float32], mask: NDArray[np.bool_] | None, camera: Camera
+) -> Picture:
+    """A small picture without distortion. rgb: [H, W, 3]; depth: [H, W] m, 0 = none; mask: [H, W], True = dynamic."""
+    scale = _SIDE / max(camera.width, camera.height)
+    width, height = round(camera.width * scale), round(camera.height * scale)
+    cx, cy = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
+    small = Camera(camera.fx * scale, camera.fy * scale, cx, cy, width, height, camera.depth_scale)
+    maps = maps_onto(camera, small)
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    gray = cv2.GaussianBlur(gray, (0, 0), 0.5 / scale) if scale < 1 else gray
+    still = depth if mask is None else np.where(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0, 0, depth)
+    readings = cv2.remap(still.astype(np.float32), *maps, cv2.INTER_NEAREST)
+    return Picture(_float32(cv2.remap(gray, *maps, cv2.INTER_LINEAR)), _float32(readings), small)
+
+
+def _float32(image: object) -> NDArray[np.float32]:
+    return np.asarray(image, dtype=np.float32)
+
+
+def align(of_map: Picture, local: Picture, T: Array) -> Alignment | None:
+    """Refine T: [4, 4] camera of the map's picture to camera of the local one, m; coarse to fine.
+
+    Returns None when the pictures hardly overlap or there is nothing to hold on to.
+    """
+    pairs = [(of_map, local)]
+    for _ in range(_LEVELS - 1):
+        pairs.append((pairs[-1][0].half(), pairs[-1][1].half()))
+    levels = [(_Template(picture), other) for picture, other in pairs]
+    start = _compare(*levels[0], T)
+    refined = T
+    for template, other in reversed(levels):
+        found = _align_level(template, other, refined)
+        if found is None:
+            return None
+        refined = found
+    end = _compare(*levels[0], refined)
+    if start is None or end is None:
+        return None
+    correlation = float(np.corrcoef(end.template, end.sampled)[0, 1])
+    return Alignment(refined, start.error, end.error, correlation, end.overlap, end.agreement)
+
+
+class _Template:
+    """The map's picture, with the steepest-descent image of its usable pixels."""
+
+    def __init__(self, picture: Picture) -> None:
+        camera, depth = picture.camera, picture.depth
+        near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
+        usable: NDArray[np.bool_] = np.asarray((near > 0) & (far - near < _EDGE * depth))
+        usable[:, [0, -1]] = usable[[0, -1], :] = False
+        rows, columns = np.nonzero(usable)
+        pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+        self.points = camera.backproject(pixels, depth[rows, columns].astype(np.float64))
+        self.values = picture.gray[rows, columns].astype(np.float64)
+        vertical, horizontal = (np.gradient(picture.gray.astype(np.float64), axis=axis) for axis in (0, 1))
+        gradient = np.stack([horizontal, vertical], axis=-1)[rows, columns]
+        self.descent = np.einsum("xi,xij->xj", gradient, warp_jacobian(self.points, camera))
+
+
+def warp_jacobian(points: Array, camera: Camera) -> Array:
+    """dW/dp at p = 0. points: [x, 3] in the camera frame, m. Returns [x, 2, 6] px per (m, rad)."""
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    result = np.zeros((len(points), 2, 6))
+    result[:, 0, 0], result[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    result[:, 1, 1], result[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    result[:, 0, 3:] = np.stack([-camera.fx * x * y / z**2, camera.fx * (1 + (x / z) ** 2), -camera.fx * y / z], axis=1)
+    result[:, 1, 3:] = np.stack([-camera.fy * (1 + (y / z) ** 2), camera.fy * x * y / z**2, camera.fy * x / z], axis=1)
+    return result
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """A template in a local picture.
+
+    seen: [x] bool, which pixels both see; template, sampled: [s] their grey values in both, the latter with the gain
+    and offset of the former; residual: [s] clipped; error, overlap, agreement: as in Alignment.
+    """
+
+    seen: NDArray[np.bool_]
+    template: Array
+    sampled: Array
+    residual: Array
+    error: float
+    overlap: float
+    agreement: float
+
+
+def _compare(template: _Template, local: Picture, T: Array) -> _Comparison | None:
+    carried = to_local(T, template.points)
+    z = np.maximum(carried[:, 2], 0.05)
+    pixels = local.camera.project(np.column_stack([carried[:, :2], z]))
+    there = _sample(local.depth, pixels, cv2.INTER_NEAREST)
+    with_reading = there > 0
+    seen = np.asarray(with_reading & (np.abs(there - z) < _SAME_DEPTH * z))
+    if seen.sum() < _FEWEST:
+        return None
+    sampled, values = _sample(local.gray, pixels[seen], cv2.INTER_LINEAR), template.values[seen]
+    spread = float(values.std()) + 1e-6
+    sampled = (sampled - sampled.mean()) * (spread / (sampled.std() + 1e-6)) + values.mean()
+    residual = sampled - values
+    limit = _CLIP * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+    error = float(np.minimum(np.abs(residual), spread).mean()) / spread
+    share = float(seen.sum())
+    residual = np.clip(residual, -limit, limit)
+    return _Comparison(seen, values, sampled, residual, error, share / len(seen), share / float(with_reading.sum()))
+
+
+def _sample(image: NDArray[np.float32], pixels: Array, interpolation: int) -> Array:
+    """[x] values at pixels [x, 2]; 0 outside."""
+    x, y = (np.ascontiguousarray(pixels[None, :, axis], dtype=np.float32) for axis in (0, 1))
+    found = cv2.remap(image, x, y, interpolation, borderValue=0)
+    return np.asarray(found[0], dtype=np.float64)
+
+
+def _align_level(template: _Template, local: Picture, T: Array) -> Array | None:
+    for _ in range(_STEPS):
+        now = _compare(template, local, T)
+        if now is None:
+            return None
+        descent = template.descent[now.seen]
+        H = descent.T @ descent + 1e-9 * np.eye(6)  # equation 10
+        step = np.linalg.solve(H, descent.T @ now.residual)  # equation 11, see above; the residual is I_LM(W) - I_PM
+        T = T @ inverse(exp_se3(step))  # equation 12, composed
+        if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
+            break
+    return T

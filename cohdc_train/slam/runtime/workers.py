@@ -1,0 +1,68 @@
+"""What runs beside tracking in real time: the source at its own pace, the segmenter, local bundle adjustment."""
+
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cohdc_train.slam.dynamics.mask_sources import FolderMasks, MaskSource, ModelMasks, no_masks
+from cohdc_train.slam.frame import OnPose, Pose
+from cohdc_train.slam.io.results import quantiles
+from cohdc_train.slam.io.sources import Source
+from cohdc_train.slam.mapping.background_bundle_adjustment import worker_process
+from cohdc_train.slam.runtime.async_masks import AsyncMasks
+from cohdc_train.slam.runtime.paced_source import Paced
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The parts of a run that others wait for no longer. masks: None when nothing is masked."""
+
+    source: Paced
+    masks: AsyncMasks | None
+    executor: Executor
+
+    @property
+    def mask_of(self) -> MaskSource:
+        """Every frame's mask."""
+        return self.masks or no_masks
+
+    def answering(self, on_pose: OnPose | None) -> OnPose:
+        """The same, after the source has learnt that there is an answer."""
+
+        def answered(pose: Pose) -> None:
+            self.source.answered()
+            if on_pose is not None:
+                on_pose(pose)
+
+        return answered
+
+    def metrics(self) -> dict[str, Any]:
+        """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until its pose was known), of
+        the masks' `age`, and of the `segmenter`, for which nobody waited; how many frames were `dropped`; by how many
+        seconds playing fell `behind` the recording."""
+        result: dict[str, Any] = {
+            "dropped": self.source.dropped,
+            "behind_s": self.source.behind,
+            "latency_ms": _milliseconds(self.source.latencies),
+        }
+        if self.masks is not None:
+            result["mask_age_ms"] = _milliseconds(self.masks.ages)
+            result["segmenter_ms"] = quantiles(self.masks.segment_ms)
+        return result
+
+
+@contextmanager
+def workers(source: Source, masks: FolderMasks | ModelMasks | None) -> Iterator[Workers]:
+    """Start them; when the block ends, they end."""
+    with ExitStack() as stack:
+        executor = stack.enter_context(worker_process())
+        beside = None if masks is None else stack.enter_context(AsyncMasks(masks.outline))
+        yield Workers(stack.enter_context(Paced(source)), beside, executor)
+
+
+def _milliseconds(seconds: list[float]) -> dict[str, float]:
+    return quantiles((1e3 * np.array(seconds)).tolist())

@@ -1,0 +1,1 @@
+"""The pose of each frame."""

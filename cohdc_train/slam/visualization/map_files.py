@@ -1,0 +1,56 @@
+"""The map a run leaves: map.ply and its picture map.png, and with the dense cloud cloud.ply."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.files import write_bytes
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.ply import write_ply
+from cohdc_train.slam.io.results import FrameRecord
+from cohdc_train.slam.io.sources import View
+from cohdc_train.slam.optimization.pose import inverse
+from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.visualization.depth_fusion import KeyframeImages, fuse
+from cohdc_train.slam.visualization.point_cloud import PointColours, from_above
+
+_VOXEL = 0.01  # m
+
+
+class MapFiles:
+    """Watches a run for what its map's files need beside the map. folder: where they go; cloud: whether cloud.ply."""
+
+    def __init__(self, camera: Camera, folder: Path, cloud: bool) -> None:
+        self._folder = folder
+        self._colours = PointColours()
+        self._open = ExitStack()
+        self._images = self._open.enter_context(KeyframeImages(camera, folder)) if cloud else None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+        """Note colours of points, and keep the pictures of keyframes for the cloud."""
+        self._colours(view, mask, record, tracker)
+        if self._images is not None:
+            self._images(view, mask, record, tracker)
+
+    def write(self, tracker: Tracker) -> None:
+        """Write the files, with keyframes and points where the map has them now."""
+        cloud = self._colours.cloud(tracker.map)
+        write_ply(self._folder / "map.ply", cloud.points, cloud.colours)
+        stamps, poses = tracker.trajectory()
+        if self._images is not None:
+            frames = dict(zip(stamps.tolist(), inverse(poses), strict=True))  # with keyframes that left the map
+            cloud = fuse(self._images, frames, tracker.camera, _VOXEL)
+            write_ply(self._folder / "cloud.ply", cloud.points, cloud.colours)
+        if len(poses):
+            picture = cv2.cvtColor(from_above(cloud, list(poses)), cv2.COLOR_RGB2BGR)
+            write_bytes(self._folder / "map.png", cv2.imencode(".png", picture)[1].tobytes())
