@@ -171,7 +171,7 @@ def _export(out: Path) -> None:
 
 
 def _slam(sequence: Path, out: Path, model: Path | None, seed: int) -> dict[str, Any]:
-    from cohdc_train.slam.dynamics.mask_sources import Culling
+    from cohdc_train.slam.config import Culling
     from cohdc_train.slam.run import slam
 
     # A network trained for minutes misses limbs and doubts people at the border: trust less, cut wider.

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from cohdc_train.errors import DataError
+
 
 @dataclass(frozen=True)
 class Method:
@@ -30,3 +32,33 @@ class Method:
     smoothing: bool = True
     keyframe_culling: bool = True
     flow: bool = True
+
+
+@dataclass(frozen=True)
+class Culling:
+    """How a frame's mask is made of what a segmenter or a folder gives.
+
+    Args:
+        dynamic_classes: names of the classes that may move; all classes of the model when not given.
+        score: detections below this class score are ignored.
+        quality: detections below this CQE quality are ignored; the paper's filter is 0.9. A contour left out is a
+            person left in: by default none is.
+        dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (1 + doubt * (1 - q)).
+        doubt: how much more a contour grows that CQE trusts not at all; at 0 all grow alike. When not given, 1, or 0
+            for a network whose masks are cut by quality: a doubtful contour has its doubtful rim already.
+    """
+
+    dynamic_classes: list[str] | None = None
+    score: float = 0.5
+    quality: float = 0.0
+    dilate: int = 10
+    doubt: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.dilate < 0:
+            raise DataError(f"dilate is {self.dilate}; it cannot be below 0")
+        if self.doubt is not None and not 0 <= self.doubt < float("inf"):
+            raise DataError(f"doubt is {self.doubt:g}; it cannot be below 0 or infinite")
+        for name in ("score", "quality"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise DataError(f"{name} is {getattr(self, name):g}; it must lie within 0..1")

@@ -1,11 +1,12 @@
 """What a tracker says of a frame, and when."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cohdc_train.slam.optimization.pose import Array, inverse
-from cohdc_train.slam.tracking.localizer import Fit
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.geometry.se3 import Array
 
 
 @dataclass(frozen=True)
@@ -29,25 +30,31 @@ class Pose:
 OnPose = Callable[[Pose], None]
 
 
-class Answer:
-    """A frame's pose from when it is known, and the time that took from the answer's making on."""
+@dataclass(frozen=True)
+class FrameRecord:
+    """One frame of a run. stamp: as rgb.txt writes it; culled: share of the pixels under the mask; segment_ms: time of
+    the mask; depth_ms: of the depth, where it was computed."""
 
-    def __init__(self, t: float, on_pose: OnPose | None) -> None:
-        self._t, self._on_pose = t, on_pose
-        self._start = time.perf_counter()
-        self._known: float | None = None
+    stamp: str
+    pose: Pose
+    culled: float
+    segment_ms: float
+    depth_ms: float = 0.0
 
-    def give(self, fit: Fit | None) -> None:
-        """The first one counts, and is told."""
-        if self._known is not None:
-            return
-        self._known = time.perf_counter()
-        if self._on_pose is not None:
-            self._on_pose(self.pose(fit, keyframe=False))
 
-    def pose(self, fit: Fit | None, keyframe: bool) -> Pose:
-        """What became of the frame so far. fit: None when the place is lost."""
-        assert self._known is not None
-        T_wc, inliers = (None, 0) if fit is None else (inverse(fit.T_cw), len(fit.matches))
-        rest = time.perf_counter() - self._known
-        return Pose(self._t, T_wc, keyframe, inliers, 1e3 * (self._known - self._start), 1e3 * rest)
+@dataclass(frozen=True)
+class View:
+    """One frame as the tracker takes it.
+
+    t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending, which a mask in a
+    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading; depth_t: s, when
+    depth was taken, where that differs from t; depth_ms: what it took to compute.
+    """
+
+    t: float
+    stamp: str
+    name: str
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    depth_t: float | None = None
+    depth_ms: float = 0.0

@@ -9,21 +9,22 @@ from typing import Any
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
-from cohdc_train.slam.config import Method
-from cohdc_train.slam.dynamics.mask_sources import Culling, FolderMasks, ModelMasks, no_masks
+from cohdc_train.slam.config import Culling, Method
+from cohdc_train.slam.dynamics.mask_sources import FolderMasks, ModelMasks, no_masks
 from cohdc_train.slam.frame import OnPose
-from cohdc_train.slam.geometry.camera import Camera, choose_camera
-from cohdc_train.slam.io.live import Followed, stopped_by_ctrl_c
+from cohdc_train.slam.geometry.calibration import choose_camera
+from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.growing_sequence import Followed
+from cohdc_train.slam.io.live import stopped_by_ctrl_c
 from cohdc_train.slam.io.results import check_out, measure, publish, write_run
 from cohdc_train.slam.io.sources import Recorded, Source, rgbd_layout
 from cohdc_train.slam.io.stereo import stereo_layout
-from cohdc_train.slam.runner import play
+from cohdc_train.slam.runner import Watcher, play
 from cohdc_train.slam.runtime.threads import one_thread
 from cohdc_train.slam.runtime.workers import workers
 from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import Viewer
-from cohdc_train.slam.watching import Watcher
 from cohdc_train.trajectory import Trajectory, read_tum
 
 _FEATURES = 1500  # corners per frame

@@ -5,18 +5,30 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.dynamics.mask_sources import MaskSource
-from cohdc_train.slam.features.orb import FeatureExtractor, Features
-from cohdc_train.slam.frame import OnPose
-from cohdc_train.slam.io.results import FrameRecord, draw_after, draw_before, write_jpeg
-from cohdc_train.slam.io.sources import Source, View
+from cohdc_train.slam.features.keypoints import Features
+from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.frame import FrameRecord, OnPose, View
+from cohdc_train.slam.io.sources import Source
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.slam.watching import Watcher
+from cohdc_train.slam.visualization.overlays import draw_after, draw_before, write_jpeg
+
+
+class Watcher(Protocol):
+    """Sees every frame of a run: the recorder of a cloud, a viewer, a robot's own publisher."""
+
+    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+        """After a frame. mask: [H, W] bool, True = dynamic: what was masked, at rest or not, and what depth found to
+        move; None where there was neither. record.pose.T_wc: its pose; when record.pose.keyframe, the map's keyframe of
+        the time view.t is this frame."""
+        ...
+
 
 _PICTURES = 6
 

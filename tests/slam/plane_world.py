@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import exp_se3
+from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.trajectory import Trajectory, write_tum
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
 from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.geometry.depth_image import Picture, take_picture
+from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
 from cohdc_train.slam.loop_closing.place_recognition import Places
-from cohdc_train.slam.optimization.image_alignment import Picture, align, take_picture, warp_jacobian
-from cohdc_train.slam.optimization.pose import exp_se3, inverse, to_local
+from cohdc_train.slam.optimization.image_alignment import align, warp_jacobian
 
 Array = NDArray[np.float64]
 PATH = camera_path(20)

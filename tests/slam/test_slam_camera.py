@@ -10,7 +10,8 @@ from plane_world import CAMERA, CAMERA_YAML
 
 from cohdc_train.errors import DataError
 from cohdc_train.presets import config_path
-from cohdc_train.slam.geometry.camera import Camera, choose_camera, load_camera
+from cohdc_train.slam.geometry.calibration import choose_camera, load_camera
+from cohdc_train.slam.geometry.camera import Camera
 
 FREIBURG1 = load_camera(config_path("slam/freiburg1.yaml"))
 

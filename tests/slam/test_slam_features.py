@@ -9,9 +9,14 @@ from plane_world import CAMERA, render, room
 
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
-from cohdc_train.slam.dynamics.mask_sources import Culling, dynamic_mask, grow
+from cohdc_train.slam.config import Culling
+from cohdc_train.slam.dynamics.mask_sources import dynamic_mask
+from cohdc_train.slam.dynamics.masks import grow
+from cohdc_train.slam.features.depth_sampling import sample_depth
+from cohdc_train.slam.features.descriptors import hamming
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import match_descriptors
-from cohdc_train.slam.features.orb import FeatureExtractor, Features, hamming, sample_depth, spread
+from cohdc_train.slam.features.orb import FeatureExtractor, spread
 
 
 def test_the_mask_costs_no_budget() -> None:

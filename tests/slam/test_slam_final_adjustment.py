@@ -8,12 +8,14 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, features_at, render, room
 
-from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.features.keypoints import Features
+from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
 from cohdc_train.slam.mapping import global_bundle_adjustment as final_adjustment
-from cohdc_train.slam.mapping.global_bundle_adjustment import SeenFrames
-from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, adjust_everything
-from cohdc_train.slam.mapping.map import Keyframe, Map, observations
-from cohdc_train.slam.optimization.pose import Weighing, exp_se3, inverse, to_local
+from cohdc_train.slam.mapping.global_bundle_adjustment import SeenFrames, adjust_everything
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.reprojection import Weighing
 from cohdc_train.slam.tracking.motion_model import FEW
 from cohdc_train.slam.tracking.tracker import Tracker
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.config import Method
+from cohdc_train.slam.features.keypoints import Corners
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import Corners
 from cohdc_train.slam.frame import Pose
-from cohdc_train.slam.optimization.pose import Prior, exp_se3
+from cohdc_train.slam.geometry.se3 import exp_se3
+from cohdc_train.slam.optimization.reprojection import Prior
 from cohdc_train.slam.tracking.flow_tracker import FlowTracker, Followed
 from cohdc_train.slam.tracking.motion_model import Expectation
 from cohdc_train.slam.tracking.tracker import Tracker

@@ -7,11 +7,12 @@ import pytest
 from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam.config import Method
+from cohdc_train.slam.geometry.se3 import Array, exp_se3
+from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
 from cohdc_train.slam.mapping.local_bundle_adjustment import WINDOW, Solution, close_window, open_window
-from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.patch_refiner import affine
-from cohdc_train.slam.optimization.pose import Array, exp_se3
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plane_world import write_sequence
 from tool_loader import load_tool
 
-from cohdc_train.slam.io.sources import View
+from cohdc_train.slam.frame import View
 from cohdc_train.slam.run import slam
 
 

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room, write_sequence
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.io.live import Followed, Live
-from cohdc_train.slam.io.sources import View, rgbd_layout
+from cohdc_train.slam.frame import View
+from cohdc_train.slam.io.growing_sequence import Followed
+from cohdc_train.slam.io.live import Live
+from cohdc_train.slam.io.sources import rgbd_layout
 from cohdc_train.slam.io.tum import Entry
 from cohdc_train.slam.run import run_source, slam
 
@@ -125,7 +127,7 @@ def test_a_camera_may_fill_one_buffer_again_and_again() -> None:
 def test_a_broken_line_or_image_later_on_is_told_and_left_out(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cohdc_train.slam.io.live._PATIENCE", 0.1)
+    monkeypatch.setattr("cohdc_train.slam.io.growing_sequence._PATIENCE", 0.1)
     folder = Path(shutil.copytree(recorded, tmp_path / "room"))
     lines = (folder / "rgb.txt").read_text().splitlines()
     broken = folder / lines[6].split()[1]

@@ -9,11 +9,13 @@ from plane_world import CAMERA
 
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.geometry.depth_image import Picture, take_picture
+from cohdc_train.slam.geometry.se3 import exp_se3, inverse
 from cohdc_train.slam.loop_closing.verification import Loop, Verifier
-from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_everything
-from cohdc_train.slam.mapping.map import Keyframe, Map, observations
-from cohdc_train.slam.optimization.image_alignment import Picture, take_picture
-from cohdc_train.slam.optimization.pose import Weighing, chi_square, exp_se3, inverse
+from cohdc_train.slam.mapping.global_bundle_adjustment import adjust_everything
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.reprojection import Weighing, chi_square
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 

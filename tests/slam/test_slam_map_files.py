@@ -15,7 +15,8 @@ from cohdc_train.cli import main
 from cohdc_train.slam.io.ply import write_ply
 from cohdc_train.slam.run import slam
 from cohdc_train.slam.visualization.depth_fusion import fuse, sure, unmasked
-from cohdc_train.slam.visualization.point_cloud import Cloud, from_above
+from cohdc_train.slam.visualization.point_cloud import Cloud
+from cohdc_train.slam.visualization.top_view import from_above
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 Points = NDArray[np.float64]

@@ -3,7 +3,8 @@
 import numpy as np
 from plane_world import CAMERA, features_at
 
-from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.map_points import cull
 
 ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them

@@ -6,17 +6,9 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam.config import Method
-from cohdc_train.slam.optimization.pose import (
-    Observations,
-    Prior,
-    Weighing,
-    exp_se3,
-    inverse,
-    log_se3,
-    optimize_pose,
-    pose_information,
-    to_local,
-)
+from cohdc_train.slam.geometry.se3 import exp_se3, inverse, log_se3, to_local
+from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
+from cohdc_train.slam.optimization.reprojection import Observations, Prior, Weighing
 from cohdc_train.slam.tracking import motion_model as motion_module
 from cohdc_train.slam.tracking.motion_model import _EXACT, ACCELERATION, Motion
 from cohdc_train.slam.tracking.tracker import Tracker

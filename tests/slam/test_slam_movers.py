@@ -15,12 +15,14 @@ from cohdc_train.slam.dynamics.dynamic_mask import DynamicMask
 from cohdc_train.slam.dynamics.free_space import Geometry, Reference
 from cohdc_train.slam.dynamics.motion_segmentation import moving_group, pose_of_rest
 from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.geometry.se3 import Array, exp_se3
 from cohdc_train.slam.io.live import Live
-from cohdc_train.slam.io.results import FrameRecord
-from cohdc_train.slam.io.sources import View
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.optimization.pose import Array, Observations, Weighing, exp_se3, optimize_pose
+from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.pose import optimize_pose
+from cohdc_train.slam.optimization.reprojection import Observations, Weighing
 from cohdc_train.slam.runner import play
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score

@@ -9,21 +9,19 @@ from plane_world import CAMERA
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
+from cohdc_train.slam.geometry.se3 import exp_se3, skew, to_local
 from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, local_points, measurement_chi2
-from cohdc_train.slam.optimization.pose import (
+from cohdc_train.slam.optimization.pose import optimize_pose
+from cohdc_train.slam.optimization.ransac import ransac_pose, rigid_transforms
+from cohdc_train.slam.optimization.reprojection import (
     CHI2_DEPTH,
     Observations,
     Weighing,
     chi_square,
-    exp_se3,
-    optimize_pose,
     pose_jacobian,
     residual_jacobian,
     residuals,
-    skew,
-    to_local,
 )
-from cohdc_train.slam.optimization.ransac import ransac_pose, rigid_transforms
 
 Array = NDArray[np.float64]
 WEIGHING = Weighing(CAMERA)

@@ -8,7 +8,7 @@ import pytest
 from plane_world import CAMERA
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.io.sources import View
+from cohdc_train.slam.frame import View
 from cohdc_train.slam.runtime.latest_slot import Slot
 from cohdc_train.slam.runtime.paced_source import Paced
 

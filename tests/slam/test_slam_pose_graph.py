@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import logm
 
-from cohdc_train.slam.optimization.pose import exp_se3, inverse, log_se3
+from cohdc_train.slam.geometry.se3 import exp_se3, inverse, log_se3
 from cohdc_train.slam.optimization.pose_graph import Edges, edge_errors, edge_jacobians, optimize_graph
 
 Array = NDArray[np.float64]

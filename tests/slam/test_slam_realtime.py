@@ -20,13 +20,13 @@ from threadpoolctl import threadpool_info
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import Method
-from cohdc_train.slam.dynamics.mask_propagation import halve_mask
-from cohdc_train.slam.dynamics.mask_sources import Mask
-from cohdc_train.slam.io.sources import View
-from cohdc_train.slam.mapping.background_bundle_adjustment import worker_process
+from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, halve_mask
+from cohdc_train.slam.dynamics.masks import Mask
+from cohdc_train.slam.frame import View
+from cohdc_train.slam.geometry.se3 import exp_se3, to_local
 from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, close_window, open_window
-from cohdc_train.slam.optimization.pose import exp_se3, to_local
-from cohdc_train.slam.runtime.async_masks import AsyncMasks, CarriedMasks
+from cohdc_train.slam.runtime.async_masks import AsyncMasks
+from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 

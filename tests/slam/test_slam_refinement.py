@@ -12,9 +12,10 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.features.orb import FeatureExtractor, gray_of
-from cohdc_train.slam.mapping.map import observations
-from cohdc_train.slam.mapping.patch_refiner import Pyramid, Refiner, affine, align, warped
-from cohdc_train.slam.optimization.pose import Array, exp_se3, inverse, to_local
+from cohdc_train.slam.features.patch_alignment import Pyramid, align, warped
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, to_local
+from cohdc_train.slam.mapping.keyframe import observations
+from cohdc_train.slam.mapping.patch_refiner import Refiner, affine
 from cohdc_train.slam.tracking.tracker import Tracker
 
 PICTURE = cv2.cvtColor(cv2.GaussianBlur(texture(np.random.default_rng(0), 240, 320), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)

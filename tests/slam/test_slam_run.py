@@ -16,10 +16,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
-from cohdc_train.slam.config import Method
-from cohdc_train.slam.dynamics.mask_sources import Culling, ModelMasks
-from cohdc_train.slam.geometry.camera import choose_camera
-from cohdc_train.slam.io.sources import Recorded, View
+from cohdc_train.slam.config import Culling, Method
+from cohdc_train.slam.dynamics.mask_sources import ModelMasks
+from cohdc_train.slam.frame import View
+from cohdc_train.slam.geometry.calibration import choose_camera
+from cohdc_train.slam.io.sources import Recorded
 from cohdc_train.slam.run import run_source, slam
 from cohdc_train.trajectory import read_tum
 

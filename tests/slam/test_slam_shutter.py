@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plane_world import CAMERA, features_at
 
-from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.rolling_shutter import unrolled
-from cohdc_train.slam.optimization.pose import Array, exp_se3, to_local
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 
 ROLLING = replace(CAMERA, readout=0.02)
 speeds = st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6)

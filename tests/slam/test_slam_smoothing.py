@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.slam.config import Method
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
 from cohdc_train.slam.optimization import trajectory_smoothing as smoothing
-from cohdc_train.slam.optimization.pose import Array, Prior, exp_se3, inverse, log_se3
+from cohdc_train.slam.optimization.reprojection import Prior
 from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
 from cohdc_train.slam.tracking.motion_model import ACCELERATION
 from cohdc_train.slam.tracking.tracker import Tracker

@@ -13,7 +13,8 @@ from plane_world import CAMERA, CAMERA_YAML, camera_path, passer_by, render, roo
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
-from cohdc_train.slam.geometry.camera import Camera, load_camera
+from cohdc_train.slam.geometry.calibration import load_camera
+from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.sources import Recorded
 from cohdc_train.slam.io.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_layout
 

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from cohdc_train.slam.dynamics.moving_surfaces import JUMP, Bits, Movers, surfaces
-from cohdc_train.slam.optimization.pose import exp_se3
+from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 

@@ -5,10 +5,10 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
+from cohdc_train.slam.features.keypoints import Corners, Features
 from cohdc_train.slam.features.matching import Matches, Projected, match_projected, one_to_one
-from cohdc_train.slam.features.orb import Corners, Features
 from cohdc_train.slam.frame import Pose
-from cohdc_train.slam.optimization.pose import exp_se3, inverse
+from cohdc_train.slam.geometry.se3 import exp_se3, inverse
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory import Trajectory, score
 

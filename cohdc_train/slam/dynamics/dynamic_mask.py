@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.free_space import Comparison, Geometry, Reference
-from cohdc_train.slam.dynamics.mask_sources import Mask, grow
+from cohdc_train.slam.dynamics.masks import Mask, grow
 from cohdc_train.slam.dynamics.moving_surfaces import Movers
-from cohdc_train.slam.mapping.map import Keyframe
-from cohdc_train.slam.optimization.pose import Array
+from cohdc_train.slam.geometry.se3 import Array
+from cohdc_train.slam.mapping.keyframe import Keyframe
 
 _REFERENCES = 8  # keyframes whose depth a frame is held against
 _BAND = 8.0  # px: a coarse pixel's width, around what depth finds

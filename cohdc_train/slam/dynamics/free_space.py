@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.moving_surfaces import JUMP, LEAST
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import Array, inverse
+from cohdc_train.slam.geometry.se3 import Array, inverse
 
 _STEP = 8  # px of the image per coarse pixel
 _CENTRE = (_STEP - 1) / 2

@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.frame import View
+
 Floats = NDArray[np.float32]
 
 _GATE = 0.3  # m: what moves from one frame to the next keeps its depth
@@ -135,3 +137,42 @@ def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:
     weight = part.astype(np.float32)
     share, sums = cv2.boxFilter(weight, -1, size), cv2.boxFilter(weight * depth, -1, size)
     return share > 1e-4, np.abs(depth * share - sums) < _GATE * share
+
+
+@dataclass(frozen=True)
+class Job:
+    """A frame that may be segmented. number: as Propagation counts."""
+
+    number: int
+    view: View
+    half: Half
+
+
+class CarriedMasks:
+    """The newest mask there is, carried to every frame, and grown there by what its outline asked for.
+
+    newest: the frame that it was made of, None before the first.
+    """
+
+    def __init__(self) -> None:
+        self.newest: Job | None = None
+        self._growth = 0.0
+        self._propagation = Propagation()
+
+    def advance(self, view: View) -> Job:
+        """Go on to the next view."""
+        half = halve(view.rgb, view.depth)
+        return Job(self._propagation.advance(half), view, half)
+
+    def renew(self, job: Job, mask: Mask, growth: float) -> None:
+        """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is to grow."""
+        self.newest, self._growth = job, growth
+        self._propagation.renew(mask, job.number, job.half)
+
+    def mask(self, view: View) -> Mask:
+        """[H, W] bool, True = dynamic, for the view that was gone on to."""
+        mask = self._propagation.mask()
+        assert mask is not None
+        height, width = view.rgb.shape[:2]
+        grown = grow(mask, self._growth / 2).astype(np.uint8)
+        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)

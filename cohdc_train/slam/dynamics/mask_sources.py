@@ -1,69 +1,20 @@
 """Masks of what moves: from a segmenter's ONNX or a folder of PNGs, dilated, True = dynamic."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections, Segmenter
+from cohdc_train.slam.config import Culling
+from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import View
 from cohdc_train.slam.io.tum import read_mask
 
-Mask = NDArray[np.bool_]
 MaskSource = Callable[[View], Mask | None]
-
-
-@dataclass(frozen=True)
-class Culling:
-    """How a frame's mask is made of what a segmenter or a folder gives.
-
-    Args:
-        dynamic_classes: names of the classes that may move; all classes of the model when not given.
-        score: detections below this class score are ignored.
-        quality: detections below this CQE quality are ignored; the paper's filter is 0.9. A contour left out is a
-            person left in: by default none is.
-        dilate: px by which a mask grows; a detection of CQE quality q grows by dilate * (1 + doubt * (1 - q)).
-        doubt: how much more a contour grows that CQE trusts not at all; at 0 all grow alike. When not given, 1, or 0
-            for a network whose masks are cut by quality: a doubtful contour has its doubtful rim already.
-    """
-
-    dynamic_classes: list[str] | None = None
-    score: float = 0.5
-    quality: float = 0.0
-    dilate: int = 10
-    doubt: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.dilate < 0:
-            raise DataError(f"dilate is {self.dilate}; it cannot be below 0")
-        if self.doubt is not None and not 0 <= self.doubt < float("inf"):
-            raise DataError(f"doubt is {self.doubt:g}; it cannot be below 0 or infinite")
-        for name in ("score", "quality"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise DataError(f"{name} is {getattr(self, name):g}; it must lie within 0..1")
-
-
-def grow(mask: Mask, radius: float) -> Mask:
-    """[H, W] bool, True within `radius` px of a True pixel of `mask`."""
-    if radius <= 0 or not mask.any():
-        return mask
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    window = (_reach(rows, radius), _reach(columns, radius))
-    distance = cv2.distanceTransform((~mask[window]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    grown = np.zeros_like(mask)
-    grown[window] = distance <= radius
-    return grown
-
-
-def _reach(places: NDArray[np.int64], radius: float) -> slice:
-    """From the first of rising places to the last, with `radius` more on both sides."""
-    margin = int(np.ceil(radius))
-    return slice(max(int(places[0]) - margin, 0), int(places[-1]) + margin + 1)
 
 
 def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Culling) -> Mask:

@@ -13,17 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import linkage
 
-from cohdc_train.slam.optimization.pose import (
-    Array,
+from cohdc_train.slam.geometry.se3 import Array, to_local
+from cohdc_train.slam.optimization.pose import optimize_pose
+from cohdc_train.slam.optimization.reprojection import (
     Observations,
     Prior,
     Weighing,
     huber_weights,
-    optimize_pose,
     pose_jacobian,
     residual_jacobian,
     residuals,
-    to_local,
 )
 
 _PATCHES = 24  # of neighbouring points: the leaves of the tree of groups

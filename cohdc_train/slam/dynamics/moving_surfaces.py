@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.optimization.pose import Array
+from cohdc_train.slam.geometry.se3 import Array
 
 JUMP = 0.12  # m of depth from one coarse pixel to the next, from which on they belong to two surfaces
 LEAST = 8  # coarse px of a mover: smaller ones are noise at edges

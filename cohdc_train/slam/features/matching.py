@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.orb import LEVELS, Features, bits_of, hamming
+from cohdc_train.slam.features.descriptors import bits_of, hamming
+from cohdc_train.slam.features.keypoints import LEVELS, Features
 
 _WIDEST = 2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
 

@@ -1,87 +1,21 @@
 """ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that can be trusted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.features.depth_sampling import sample_depth
+from cohdc_train.slam.features.keypoints import _SCALES, LEVELS, SCALE, Corners, Features
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import inverse, to_local
+from cohdc_train.slam.geometry.se3 import inverse, to_local
 
-SCALE = 1.2  # between two levels of the image pyramid
-LEVELS = 8
-_PRECISE = 0.3  # px at its level: standard deviation of a corner that was moved to where its point's patch fits best
-_SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
 _CELL = 32  # px at the level of the corner
 _POOL = 2.0  # corners detected per corner kept: what the grid chooses from
 _ENOUGH = 1.6  # the same, below which the next threshold is tried
 _THRESHOLDS = (40, 20, 12, 7)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
-_EDGE_PATCH = 2  # px: a depth edge this near to a corner spoils its depth
-_EDGE_RELATIVE = 0.04  # of the depth: a larger step inside the patch is an edge
-_MASK_BAND = 2  # px beside the mask where depth is refused
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Where n corners lie in an image, and what they look like; fields as those of Features."""
-
-    pixels: NDArray[np.float64]
-    octaves: NDArray[np.int64]
-    descriptors: NDArray[np.uint64]
-    precise: NDArray[np.bool_]
-
-    def take(self, rows: NDArray[np.int64]) -> "Corners":
-        """The chosen rows."""
-        return Corners(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.precise[rows])
-
-
-@dataclass(frozen=True)
-class Features:
-    """n corners of one frame.
-
-    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n] int64 pyramid level;
-    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted;
-    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to (`refinement`).
-    """
-
-    pixels: NDArray[np.float64]
-    points: NDArray[np.float64]
-    octaves: NDArray[np.int64]
-    descriptors: NDArray[np.uint64]
-    depths: NDArray[np.float64]
-    precise: NDArray[np.bool_]
-
-    def __post_init__(self) -> None:
-        n = len(self.pixels)
-        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.precise)
-        shapes = tuple(array.shape for array in arrays)
-        if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,), (n,)):
-            raise ValueError(f"features disagree in shape: {shapes}")
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def corners(self, rows: NDArray[np.int64]) -> Corners:
-        """The chosen rows, without what camera and depth said of them."""
-        return Corners(self.pixels, self.octaves, self.descriptors, self.precise).take(rows)
-
-    @property
-    def for_others(self) -> "Features":
-        """The same corners as measurements of other points than those by whose patches they are precise."""
-        return replace(self, precise=np.zeros_like(self.precise))
-
-    @property
-    def scales(self) -> NDArray[np.float64]:
-        """[n] px of the image per px of each corner's pyramid level."""
-        return np.asarray(SCALE**self.octaves, dtype=np.float64)
-
-    @property
-    def sigmas(self) -> NDArray[np.float64]:
-        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less where precise."""
-        return np.where(self.precise, _PRECISE, 1.0) * self.scales
 
 
 class FeatureExtractor:
@@ -220,39 +154,3 @@ def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:
     index = np.arange(len(groups))
     starts = np.r_[True, groups[1:] != groups[:-1]][: len(groups)]
     return np.asarray(index - np.maximum.accumulate(np.where(starts, index, 0)), dtype=np.int64)
-
-
-def sample_depth(
-    depth: NDArray[np.float32], pixels: NDArray[np.float64], mask: NDArray[np.bool_] | None = None
-) -> NDArray[np.float64]:
-    """Depth at corners, refused beside depth edges and beside the mask, where a sensor mixes near and far.
-
-    depth: [H, W] m, 0 = none; pixels: [n, 2] px; mask: [H, W], True = dynamic. Returns [n] m, nan where refused.
-    """
-    if len(pixels) == 0:
-        return np.zeros(0)
-    height, width = depth.shape
-    offsets = np.arange(-_EDGE_PATCH, _EDGE_PATCH + 1)
-    x, y = np.rint(pixels).astype(np.int64).T
-    columns = np.clip(x + offsets[:, None], 0, width - 1)
-    rows = np.clip(y + offsets[:, None], 0, height - 1)
-    patch = depth.ravel().take((rows[:, None] * width + columns).reshape(-1, len(pixels)))  # [25, n]
-    centre = patch[len(patch) // 2].astype(np.float64)
-    far = patch.max(axis=0).astype(np.float64)
-    near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=0).astype(np.float64)
-    refused = (centre <= 0) | (far - near > _EDGE_RELATIVE * centre)
-    if mask is not None:
-        reach = np.ones((2 * _MASK_BAND + 1, 2 * _MASK_BAND + 1), dtype=np.uint8)
-        band = cv2.dilate(mask.astype(np.uint8), reach)
-        refused |= band[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0
-    return np.where(refused, np.nan, centre)
-
-
-def bits_of(descriptors: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """[n, 256] 0 or 1, of descriptors [n, 4]."""
-    return np.unpackbits(np.ascontiguousarray(descriptors).view(np.uint8).reshape(-1, 32), axis=1)
-
-
-def hamming(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """first, second: [..., 4] descriptors. Returns [...] how many of the 256 bits differ."""
-    return np.asarray(np.bitwise_count(first ^ second).sum(axis=-1, dtype=np.int64))

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import Array
+from cohdc_train.slam.geometry.se3 import Array
 
 
 def unrolled(features: Features, camera: Camera, twist: Array) -> Features:

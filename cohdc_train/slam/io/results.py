@@ -6,34 +6,17 @@ import os
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.features.orb import Features
-from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.frame import FrameRecord
 from cohdc_train.trajectory import Trajectory, score, write_tum
 
 _NOT_ALWAYS = ("cloud.ply", "map.png")  # files of a run that not every run writes
-_GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """One frame of a run. stamp: as rgb.txt writes it; culled: share of the pixels under the mask; segment_ms: time of
-    the mask; depth_ms: of the depth, where it was computed."""
-
-    stamp: str
-    pose: Pose
-    culled: float
-    segment_ms: float
-    depth_ms: float = 0.0
 
 
 def measure(
@@ -118,27 +101,3 @@ def check_out(out: Path) -> None:
                 tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise DataError(f"{out}: cannot be written: {error.strerror}") from error
-
-
-def draw_before(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    """All corners an unmasked search finds: red on the mask, green elsewhere. Returns [H, W, 3] RGB."""
-    rows, columns = np.rint(features.pixels[:, 1]).astype(int), np.rint(features.pixels[:, 0]).astype(int)
-    on_mask = np.zeros(len(features), dtype=np.bool_) if mask is None else mask[rows, columns]
-    image = rgb.copy()
-    for x, y, red in zip(columns.tolist(), rows.tolist(), on_mask.tolist(), strict=True):
-        cv2.circle(image, (x, y), 2, _RED if red else _GREEN, 1, cv2.LINE_AA)
-    return image
-
-
-def draw_after(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The corners that were kept, and the outline of the mask. Returns [H, W, 3] RGB."""
-    image = draw_before(rgb, features, None)
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image, contours, -1, _YELLOW, 2)
-    return image
-
-
-def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Write [H, W, 3] RGB as JPEG."""
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
-    path.write_bytes(data.tobytes())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import Array
+from cohdc_train.slam.geometry.se3 import Array
 
 _COLOURS: dict[str, tuple[int, int | None]] = {  # encoding: channels, and OpenCV's way to RGB
     "rgb8": (3, None),

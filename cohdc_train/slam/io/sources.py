@@ -5,29 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.tum import Entry, read_depth, read_pairs, read_rgb
-
-
-@dataclass(frozen=True)
-class View:
-    """One frame as the tracker takes it.
-
-    t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending, which a mask in a
-    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading; depth_t: s, when
-    depth was taken, where that differs from t; depth_ms: what it took to compute.
-    """
-
-    t: float
-    stamp: str
-    name: str
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    depth_t: float | None = None
-    depth_ms: float = 0.0
 
 
 class Source(Protocol):

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
+from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Layout, View
+from cohdc_train.slam.io.sources import Layout
 from cohdc_train.slam.io.tum import Entry, read_rgb
 
 _MAX_DIFFERENCE = 0.005  # s between the two images of a pair: a walking camera moves 5 mm in that time

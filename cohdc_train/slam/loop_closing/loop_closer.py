@@ -4,13 +4,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from cohdc_train.slam.geometry.depth_image import Picture
+from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.loop_closing.place_recognition import Places
 from cohdc_train.slam.loop_closing.verification import Loop, Verifier
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.mapping.map_points import adjust_window, fuse_into
-from cohdc_train.slam.optimization.image_alignment import Picture
-from cohdc_train.slam.optimization.pose import Weighing, inverse
+from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.mapping.map_points import fuse_into
 from cohdc_train.slam.optimization.pose_graph import Edges, optimize_graph
+from cohdc_train.slam.optimization.reprojection import Weighing
 
 _RECENT = 10  # keyframes that cannot be a loop with the newest
 _COVISIBLE = 15  # shared points make neighbours, and neighbours are no loop

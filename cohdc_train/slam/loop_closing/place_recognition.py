@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.orb import bits_of
+from cohdc_train.slam.features.descriptors import bits_of
 
 _TABLES = 8
 _BITS = 16  # of 256, drawn per table: two descriptors meet in a table when all these agree

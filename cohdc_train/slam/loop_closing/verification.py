@@ -6,12 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
-from cohdc_train.slam.features.orb import Features
-from cohdc_train.slam.mapping.map import Keyframe, Map, observations
-from cohdc_train.slam.optimization.image_alignment import Picture, align
-from cohdc_train.slam.optimization.pose import Array, Weighing, inverse, optimize_pose
+from cohdc_train.slam.geometry.depth_image import Picture
+from cohdc_train.slam.geometry.se3 import Array, inverse
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.image_alignment import align
+from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.ransac import ransac_pose
+from cohdc_train.slam.optimization.reprojection import Weighing
 
 _PLACE = 8  # keyframes around the old one whose points make up the place
 _MIN_ROUGH = 20  # inliers of descriptor matches alone

@@ -5,21 +5,15 @@ the sums on its own copy, and the tracker's thread, between two frames, puts the
 is under way at a time; a keyframe that joins meanwhile waits, and a newer one takes its place.
 """
 
-import multiprocessing
-import os
-import signal
-from collections.abc import Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Executor, Future
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from cohdc_train.slam.geometry.se3 import Array
+from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, Window, close_window, open_window, solve
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.optimization.pose import Array, Weighing
-
-NICE = 15  # a worker gives way to tracking when there are fewer cores than work
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.reprojection import Weighing
 
 
 class BackgroundMapper:
@@ -64,19 +58,3 @@ class BackgroundMapper:
         while self._running is not None:
             self._running[1].result()
             self.collect(world)
-
-
-@contextmanager
-def worker_process() -> Iterator[Executor]:
-    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as executor:
-        executor.submit(_begin).result()
-        yield executor
-
-
-def _begin() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
-    threadpool_limits(1, "blas")
-    if hasattr(os, "nice"):
-        os.nice(NICE)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cohdc_train.slam.geometry.se3 import Array, inverse
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.pose import Array, inverse
 from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
 from cohdc_train.slam.tracking.localizer import Fit
 

@@ -4,17 +4,20 @@ A keyframe every half second is what mapping has time for on the way. The frames
 more often.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import Features
+from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.frame_history import FrameLog
-from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, adjust_everything
-from cohdc_train.slam.mapping.map import Map, observations
-from cohdc_train.slam.optimization.pose import Array, Observations, Weighing
+from cohdc_train.slam.mapping.keyframe import observations
+from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, close_window, select_window, solve
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.reprojection import Observations, Weighing
 from cohdc_train.slam.tracking.localizer import Fit
 from cohdc_train.slam.tracking.motion_model import FEW
 
@@ -85,3 +88,12 @@ def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
     there = np.flatnonzero(world.seen_by[ids] > 0)
     ids, first = np.unique(ids[there], return_index=True)
     return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))
+
+
+def adjust_everything(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> Array:
+    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first keyframe holds
+    still. Returns [s, 4, 4] T_cw of those frames, m."""
+    window = select_window(world, list(world.keyframes), 1, sightings)
+    solution = solve(np.stack(window.poses), window.points, window.problem, weighing)
+    close_window(world, window, solution)
+    return solution.poses[len(window.keyframes) :]

@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.orb import LEVELS
+from cohdc_train.slam.features.keypoints import LEVELS
+from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import WINDOW
-from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.map_points import MIN_SEEN_BY, drop_points
 
 _AROUND = 64  # keyframes that are looked at, those that share most points with the newest

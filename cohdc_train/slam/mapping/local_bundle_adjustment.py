@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.mapping.map import Keyframe, Map, observations
+from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, measurement_chi2
-from cohdc_train.slam.optimization.pose import Array, Observations, Weighing, inverse, joined, to_local
+from cohdc_train.slam.optimization.reprojection import Observations, Weighing, joined
 
 WINDOW = 12  # keyframes in local bundle adjustment
 FIXED = 3  # of them hold still and carry the frame of reference
@@ -57,19 +59,10 @@ def open_window(world: Map, keyframe: Keyframe) -> Window:
     """The keyframe with those that share most points, and their measurements."""
     keyframes = world.covisible(keyframe.seen_points(), WINDOW)
     keyframes.sort(key=lambda k: k.index)
-    return _window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
+    return select_window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
 
 
-def adjust_everything(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> Array:
-    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first keyframe holds
-    still. Returns [s, 4, 4] T_cw of those frames, m."""
-    window = _window(world, list(world.keyframes), 1, sightings)
-    solution = solve(np.stack(window.poses), window.points, window.problem, weighing)
-    close_window(world, window, solution)
-    return solution.poses[len(window.keyframes) :]
-
-
-def _window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()) -> Window:
+def select_window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()) -> Window:
     """Keyframes, the newest last, of which the first few are fixed, with all measurements of the others' points."""
     ids = world.points_of(keyframes[fixed:])
     row = np.full(world.size + 1, -1)
@@ -125,3 +118,9 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
         corners, ids = window.corners[rows], window.ids[window.problem.points[rows]]
         world.forget(member, corners[member.point_ids[corners] == ids])
     return motion
+
+
+def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
+    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not fit are dropped."""
+    window = open_window(world, keyframe)
+    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))

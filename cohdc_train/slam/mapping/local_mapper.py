@@ -5,14 +5,16 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 
 from cohdc_train.slam.config import Method
+from cohdc_train.slam.geometry.depth_image import Picture
 from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
 from cohdc_train.slam.mapping.background_bundle_adjustment import BackgroundMapper
+from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.mapping.map_points import add_points, adjust_window, cull, fuse
+from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.mapping.map_points import add_points, cull, fuse
 from cohdc_train.slam.mapping.patch_refiner import Refiner
-from cohdc_train.slam.optimization.image_alignment import Picture
-from cohdc_train.slam.optimization.pose import Weighing
+from cohdc_train.slam.optimization.reprojection import Weighing
 
 
 class LocalMapping:

@@ -1,14 +1,14 @@
 """The map: points, keyframes, and which keyframe sees which point."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.features.keypoints import LEVELS, SCALE, Features
 from cohdc_train.slam.features.matching import Matches, Projected
-from cohdc_train.slam.features.orb import LEVELS, SCALE, Features
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import Array, Observations, inverse, to_local
+from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.optimization.reprojection import Observations
 
 _NEAR = 0.1  # m
 _OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
@@ -16,38 +16,6 @@ _NEIGHBOURS = 64  # keyframes that are looked at when those that share most poin
 _STILL = 3.0  # log-odds that a new point stands still
 _WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
 _VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
-
-
-@dataclass(eq=False)
-class Keyframe:
-    """A frame the map keeps.
-
-    index: its number, Map.joined when it joins, not used again; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n]
-    int64, the map point of every corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the
-    place again; nearest: [h, w] coarse depth as Geometry.nearest gives it, m.
-    """
-
-    index: int
-    t: float
-    T_cw: Array
-    features: Features
-    point_ids: NDArray[np.int64]
-    thumbnail: NDArray[np.float32]
-    nearest: NDArray[np.float32]
-
-    def seen_points(self) -> NDArray[np.int64]:
-        """Ids of the points this keyframe sees."""
-        return self.point_ids[self.point_ids >= 0]
-
-    def centre(self) -> Array:
-        """[3] position of the camera in the world, m."""
-        return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
-
-
-def observations(features: Features, corners: NDArray[np.int64]) -> Observations:
-    """What a frame measured at some of its corners."""
-    sigmas, depth_sigmas = features.sigmas[corners], features.scales[corners]
-    return Observations(features.points[corners], features.depths[corners], sigmas, depth_sigmas)
 
 
 class Map:

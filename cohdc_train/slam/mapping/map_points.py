@@ -4,9 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.features.matching import match_projected
-from cohdc_train.slam.mapping.local_bundle_adjustment import close_window, open_window, solve
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.optimization.pose import Weighing
+from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.slam.mapping.map import Map
 
 _FUSE_KEYFRAMES = 8
 _TRIAL = 3  # keyframes after which a point must have proved itself
@@ -60,12 +59,6 @@ def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> N
     gives_way[old] = True
     stays = ~gives_way[new]  # a point that itself gives way this time waits for the next keyframe
     world.replace(old[stays], new[stays], keyframes)
-
-
-def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
-    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not fit are dropped."""
-    window = open_window(world, keyframe)
-    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))
 
 
 def cull(world: Map, newest: int) -> None:

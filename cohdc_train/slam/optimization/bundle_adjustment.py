@@ -7,17 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from cohdc_train.slam.optimization.pose import (
-    Array,
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
+from cohdc_train.slam.optimization.linear_solver import solve_symmetric
+from cohdc_train.slam.optimization.reprojection import (
     Observations,
     Weighing,
-    exp_se3,
     huber_weights,
     pose_jacobian,
     residual_jacobian,
     residuals,
-    solve_symmetric,
-    to_local,
 )
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from cohdc_train.slam.optimization.pose import Array, exp_se3, inverse, log_se3, skew, solve_symmetric
+from cohdc_train.slam.geometry.se3 import Array, adjoint, adjoint_of_algebra, exp_se3, inverse, log_se3
+from cohdc_train.slam.optimization.linear_solver import solve_symmetric
 
 _ROUNDS = 6  # in which the kernel narrows
 _STEPS = 4  # per round
@@ -47,9 +48,9 @@ def edge_errors(poses: Array, edges: Edges) -> Array:
 def edge_jacobians(poses: Array, edges: Edges) -> tuple[Array, Array]:
     """d error / d xi of the first and of the second node, [e, 6, 6] each, to second order in the error."""
     scale = np.repeat(edges.sigmas, 3, axis=1)
-    ad = _adjoint_of_algebra(edge_errors(poses, edges) * scale)
+    ad = adjoint_of_algebra(edge_errors(poses, edges) * scale)
     second = (np.eye(6) - 0.5 * ad + ad @ ad / 12) / scale[:, :, None]
-    first = -second @ _adjoint(poses[edges.second] @ inverse(poses[edges.first]))
+    first = -second @ adjoint(poses[edges.second] @ inverse(poses[edges.first]))
     return first, second
 
 
@@ -112,19 +113,3 @@ def _solve(poses: Array, edges: Edges, weights: Array, damping: float) -> Array:
     H += sparse.diags(damping * H.diagonal() + 1e-9, format="csc")
     right = -(J.T @ (edge_errors(poses, edges) * root).ravel())
     return solve_symmetric(H, right).reshape(-1, 6)
-
-
-def _adjoint(T: Array) -> Array:
-    """[n, 6, 6] with T exp(xi) = exp(adjoint xi) T."""
-    result = np.zeros((len(T), 6, 6))
-    result[:, :3, :3] = result[:, 3:, 3:] = T[:, :3, :3]
-    result[:, :3, 3:] = skew(T[:, :3, 3]) @ T[:, :3, :3]
-    return result
-
-
-def _adjoint_of_algebra(xi: Array) -> Array:
-    """[n, 6, 6], the derivative of the adjoint of exp(xi) at zero."""
-    result = np.zeros((len(xi), 6, 6))
-    result[:, :3, :3] = result[:, 3:, 3:] = skew(xi[:, 3:])
-    result[:, :3, 3:] = skew(xi[:, :3])
-    return result

@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.optimization.pose import Array, Observations
+from cohdc_train.slam.geometry.se3 import Array
+from cohdc_train.slam.optimization.reprojection import Observations
 
 _NEAR = 0.05  # m
 _PIXEL_TOLERANCE = 3.0  # px at pyramid level 0

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
-from cohdc_train.slam.optimization.pose import Array, exp_se3, inverse, log_se3
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
 from cohdc_train.slam.tracking.motion_model import ACCELERATION, LONGEST, SHORTEST
 
 _SHARED = 2e-3  # m and rad: error of a frame that its information does not know of

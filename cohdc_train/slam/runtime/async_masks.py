@@ -8,26 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.mask_propagation import Half, Propagation, halve, halve_mask
-from cohdc_train.slam.dynamics.mask_sources import Mask, grow
-from cohdc_train.slam.io.sources import View
-from cohdc_train.slam.mapping.background_bundle_adjustment import NICE
+from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
+from cohdc_train.slam.dynamics.masks import Mask
+from cohdc_train.slam.frame import View
+from cohdc_train.slam.runtime.executors import NICE
 from cohdc_train.slam.runtime.latest_slot import Slot
 
 Outline = Callable[[View], tuple[Mask, float]]
-
-
-@dataclass(frozen=True)
-class Job:
-    """A frame that may be segmented. number: as Propagation counts."""
-
-    number: int
-    view: View
-    half: Half
 
 
 @dataclass(frozen=True)
@@ -36,36 +26,6 @@ class _Done:
     mask: NDArray[np.bool_]  # half size
     growth: float  # px
     ms: float
-
-
-class CarriedMasks:
-    """The newest mask there is, carried to every frame, and grown there by what its outline asked for.
-
-    newest: the frame that it was made of, None before the first.
-    """
-
-    def __init__(self) -> None:
-        self.newest: Job | None = None
-        self._growth = 0.0
-        self._propagation = Propagation()
-
-    def advance(self, view: View) -> Job:
-        """Go on to the next view."""
-        half = halve(view.rgb, view.depth)
-        return Job(self._propagation.advance(half), view, half)
-
-    def renew(self, job: Job, mask: Mask, growth: float) -> None:
-        """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is to grow."""
-        self.newest, self._growth = job, growth
-        self._propagation.renew(mask, job.number, job.half)
-
-    def mask(self, view: View) -> Mask:
-        """[H, W] bool, True = dynamic, for the view that was gone on to."""
-        mask = self._propagation.mask()
-        assert mask is not None
-        height, width = view.rgb.shape[:2]
-        grown = grow(mask, self._growth / 2).astype(np.uint8)
-        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
 
 
 class AsyncMasks:

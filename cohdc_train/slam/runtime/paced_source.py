@@ -7,8 +7,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
+from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Source, View
+from cohdc_train.slam.io.sources import Source
 from cohdc_train.slam.runtime.latest_slot import Slot
 
 

@@ -12,8 +12,8 @@ from cohdc_train.slam.dynamics.mask_sources import FolderMasks, MaskSource, Mode
 from cohdc_train.slam.frame import OnPose, Pose
 from cohdc_train.slam.io.results import quantiles
 from cohdc_train.slam.io.sources import Source
-from cohdc_train.slam.mapping.background_bundle_adjustment import worker_process
 from cohdc_train.slam.runtime.async_masks import AsyncMasks
+from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.runtime.paced_source import Paced
 
 

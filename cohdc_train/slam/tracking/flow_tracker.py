@@ -12,11 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.features.keypoints import Corners, Features
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import Corners, Features, gray_of
+from cohdc_train.slam.features.orb import gray_of
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.optimization.pose import Array, Weighing, optimize_pose, pose_information, to_local
+from cohdc_train.slam.geometry.se3 import Array, to_local
+from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
+from cohdc_train.slam.optimization.reprojection import Weighing
 from cohdc_train.slam.tracking.localizer import Fit
 from cohdc_train.slam.tracking.motion_model import Expectation
 

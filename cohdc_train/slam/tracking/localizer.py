@@ -2,16 +2,19 @@
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.motion_segmentation import pose_of_rest
+from cohdc_train.slam.features.descriptors import thumbnail
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
-from cohdc_train.slam.features.orb import Features
-from cohdc_train.slam.mapping.map import Keyframe, Map
-from cohdc_train.slam.optimization.pose import Array, Prior, Weighing, optimize_pose, pose_information
+from cohdc_train.slam.geometry.se3 import Array
+from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
 from cohdc_train.slam.optimization.ransac import ransac_pose
+from cohdc_train.slam.optimization.reprojection import Prior, Weighing
 from cohdc_train.slam.tracking.motion_model import Expectation
 
 LOCAL_KEYFRAMES = 15
@@ -151,11 +154,3 @@ class Localizer:
             self.map.judge(ids[inlier], ids[moving])
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
         return Fit(T_cw, fit.matches.take(~moving), fit.reference, fit.prior, information)
-
-
-def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """[30, 40] float32, blurred, zero mean and unit norm: the product of two is their normalised correlation."""
-    small = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (40, 30), interpolation=cv2.INTER_AREA)
-    image = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5)
-    image -= image.mean()
-    return np.asarray(image / (np.linalg.norm(image) + 1e-6), dtype=np.float32)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cohdc_train.slam.optimization.pose import Array, Prior, exp_se3, inverse, log_se3
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
+from cohdc_train.slam.optimization.reprojection import Prior
 
 ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard deviation
 _UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known

@@ -10,21 +10,26 @@ from numpy.typing import NDArray
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.dynamics.dynamic_mask import DynamicMask
 from cohdc_train.slam.dynamics.free_space import Geometry
+from cohdc_train.slam.features.descriptors import thumbnail
+from cohdc_train.slam.features.keypoints import Corners, Features
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import Corners, FeatureExtractor, Features, gray_of
+from cohdc_train.slam.features.orb import FeatureExtractor, gray_of
 from cohdc_train.slam.features.rolling_shutter import unrolled
-from cohdc_train.slam.frame import Answer, OnPose, Pose
+from cohdc_train.slam.frame import OnPose, Pose
 from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.geometry.depth_image import take_picture
+from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse
 from cohdc_train.slam.mapping.frame_history import FrameLog
 from cohdc_train.slam.mapping.global_bundle_adjustment import SeenFrames
+from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_mapper import LocalMapping
-from cohdc_train.slam.mapping.map import Keyframe, Map
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.patch_refiner import Refiner
-from cohdc_train.slam.optimization.image_alignment import take_picture
-from cohdc_train.slam.optimization.pose import Array, Weighing, exp_se3, inverse
+from cohdc_train.slam.optimization.reprojection import Weighing
 from cohdc_train.slam.tracking.flow_tracker import FlowTracker
-from cohdc_train.slam.tracking.localizer import LOCAL_KEYFRAMES, Fit, Localizer, thumbnail
+from cohdc_train.slam.tracking.localizer import LOCAL_KEYFRAMES, Fit, Localizer
 from cohdc_train.slam.tracking.motion_model import Expectation, Motion
+from cohdc_train.slam.tracking.pose_reporter import Answer
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.82  # of the inliers right after the last keyframe: with fewer the next is due

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.mask_sources import grow
+from cohdc_train.slam.dynamics.masks import grow
+from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera, maps_onto
-from cohdc_train.slam.io.results import FrameRecord
-from cohdc_train.slam.io.sources import View
-from cohdc_train.slam.optimization.pose import Array, to_local
+from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.point_cloud import Cloud
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid

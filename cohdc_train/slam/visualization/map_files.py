@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.files import write_bytes
+from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.io.ply import write_ply
-from cohdc_train.slam.io.results import FrameRecord
-from cohdc_train.slam.io.sources import View
-from cohdc_train.slam.optimization.pose import inverse
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.depth_fusion import KeyframeImages, fuse
-from cohdc_train.slam.visualization.point_cloud import PointColours, from_above
+from cohdc_train.slam.visualization.point_cloud import PointColours
+from cohdc_train.slam.visualization.top_view import from_above
 
 _VOXEL = 0.01  # m
 

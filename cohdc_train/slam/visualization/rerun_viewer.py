@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import CohdcError, MissingExtraError
+from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.results import FrameRecord
-from cohdc_train.slam.io.sources import View
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.point_cloud import PointColours
 

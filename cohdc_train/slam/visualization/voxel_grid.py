@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.optimization.pose import Array
+from cohdc_train.slam.geometry.se3 import Array
 
 _BITS = 21  # of a key per axis
 _HALF = 1 << (_BITS - 1)

@@ -1,0 +1,71 @@
+"""Keypoints with descriptors, undistorted positions and depth."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+SCALE = 1.2  # between two levels of the image pyramid
+LEVELS = 8
+_PRECISE = 0.3  # px at its level: standard deviation of a corner that was moved to where its point's patch fits best
+_SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where n corners lie in an image, and what they look like; fields as those of Features."""
+
+    pixels: NDArray[np.float64]
+    octaves: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+    precise: NDArray[np.bool_]
+
+    def take(self, rows: NDArray[np.int64]) -> "Corners":
+        """The chosen rows."""
+        return Corners(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.precise[rows])
+
+
+@dataclass(frozen=True)
+class Features:
+    """n corners of one frame.
+
+    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n] int64 pyramid level;
+    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted;
+    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to (`refinement`).
+    """
+
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+    octaves: NDArray[np.int64]
+    descriptors: NDArray[np.uint64]
+    depths: NDArray[np.float64]
+    precise: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        n = len(self.pixels)
+        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.precise)
+        shapes = tuple(array.shape for array in arrays)
+        if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,), (n,)):
+            raise ValueError(f"features disagree in shape: {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def corners(self, rows: NDArray[np.int64]) -> Corners:
+        """The chosen rows, without what camera and depth said of them."""
+        return Corners(self.pixels, self.octaves, self.descriptors, self.precise).take(rows)
+
+    @property
+    def for_others(self) -> "Features":
+        """The same corners as measurements of other points than those by whose patches they are precise."""
+        return replace(self, precise=np.zeros_like(self.precise))
+
+    @property
+    def scales(self) -> NDArray[np.float64]:
+        """[n] px of the image per px of each corner's pyramid level."""
+        return np.asarray(SCALE**self.octaves, dtype=np.float64)
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less where precise."""
+        return np.where(self.precise, _PRECISE, 1.0) * self.scales

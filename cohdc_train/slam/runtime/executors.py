@@ -1,0 +1,28 @@
+"""Executors of background work."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+
+from threadpoolctl import threadpool_limits
+
+NICE = 15  # a worker gives way to tracking when there are fewer cores than work
+
+
+@contextmanager
+def worker_process() -> Iterator[Executor]:
+    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as executor:
+        executor.submit(_begin).result()
+        yield executor
+
+
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
+    threadpool_limits(1, "blas")
+    if hasattr(os, "nice"):
+        os.nice(NICE)
