@@ -169,3 +169,60 @@ def test_torch_is_found_through_another_room(tmp_path: Path) -> None:
 
 def test_clean_house_has_no_fault(tmp_path: Path) -> None:
     assert faults(plant(tmp_path, HOUSE)) == []
+
+
+# Rooms of slam in the order in which they build on each other: each may import those before it.
+SLAM_ROOMS = [
+    "config",
+    "geometry",
+    "features",
+    "optimization",
+    "mapping",
+    "loop_closing",
+    "frame",
+    "io",
+    "dynamics",
+    "tracking",
+    "visualization",
+    "runtime",
+    "runner",
+    "run",
+]
+# What a room leaves out of those before it.
+SLAM_APART = {
+    "frame": {"optimization", "mapping", "loop_closing"},
+    "io": {"features", "optimization", "mapping", "loop_closing"},
+    "dynamics": {"loop_closing"},
+    "tracking": {"io"},
+    "runtime": {"visualization"},
+}
+
+
+def slam_faults(folder: Path) -> list[str]:
+    """Return every import between rooms of slam that goes against their order."""
+    found = []
+    for file in sorted(folder.rglob("*.py")):
+        room = file.relative_to(folder).with_suffix("").parts[0]
+        if room == "__init__":
+            continue
+        if room not in SLAM_ROOMS:
+            found.append(f"{room} is no room of slam")
+            continue
+        allowed = set(SLAM_ROOMS[: SLAM_ROOMS.index(room)]) - SLAM_APART.get(room, set()) | {room}
+        for line, name in imported(file, folder.parent):
+            parts = name.split(".")
+            if parts[:2] == [NAME, "slam"] and parts[2] not in allowed:
+                found.append(f"{file.relative_to(folder)}:{line}: {room} imports {parts[2]}")
+    return found
+
+
+def test_rooms_of_slam_import_in_one_direction() -> None:
+    assert slam_faults(PACKAGE / "slam") == []
+
+
+def test_import_against_the_order_of_slam_is_found(tmp_path: Path) -> None:
+    room = tmp_path / NAME / "slam" / "mapping"
+    room.mkdir(parents=True)
+    (room / "map.py").write_text(f"from {NAME}.slam.tracking.tracker import Tracker\n", encoding="utf-8")
+    (fault,) = slam_faults(tmp_path / NAME / "slam")
+    assert fault == "mapping/map.py:1: mapping imports tracking"

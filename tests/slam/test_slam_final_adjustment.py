@@ -73,7 +73,7 @@ def remember(seen: SeenFrames, row: int, tracker: Tracker) -> None:
     """The tracker's latest frame, as one in that row of the log."""
     assert tracker._last is not None
     assert tracker.features is not None
-    chosen = seen.chosen(tracker._last, matched=True)
+    chosen = seen.chosen(tracker._last.matches, matched=True)
     if chosen is not None:
         seen.append(row, chosen, tracker.features, tracker.map)
 

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cohdc_train.slam.geometry.se3 import Array, inverse
+from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
-from cohdc_train.slam.tracking.localizer import Fit
 
 
 class _Logged(NamedTuple):
-    """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in it, m; information,
-    pull: as those of `Fit`."""
+    """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in it, m; information:
+    [6, 6] inverse covariance of the pose; pull: [6] gradient of what was expected of it."""
 
     t: float
     reference: int
@@ -28,12 +28,13 @@ class FrameLog:
     def __init__(self) -> None:
         self._frames: list[_Logged] = []
 
-    def append(self, t: float, fit: Fit, world: Map) -> int:
-        """The frame at t, s, after those before it. Returns its row."""
-        assert fit.reference is not None
-        index = fit.reference.index
-        relative = fit.T_cw @ inverse(world.pose(index))
-        self._frames.append(_Logged(t, index, relative, fit.information, fit.pull))
+    def append(self, t: float, T_cw: Array, reference: Keyframe, information: Array, pull: Array, world: Map) -> int:
+        """Append the frame at t, s. Returns its row.
+
+        T_cw: [4, 4] world to camera, m; reference: the keyframe it stays relative to; information, pull: as `_Logged`.
+        """
+        relative = T_cw @ inverse(world.pose(reference.index))
+        self._frames.append(_Logged(t, reference.index, relative, information, pull))
         return len(self._frames) - 1
 
     @property

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import FEW
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.geometry.se3 import Array
@@ -18,8 +19,6 @@ from cohdc_train.slam.mapping.keyframe import observations
 from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, close_window, select_window, solve
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import Observations, Weighing
-from cohdc_train.slam.tracking.localizer import Fit
-from cohdc_train.slam.tracking.motion_model import FEW
 
 _MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
 _TURNS = 2  # a matched frame gives only every second of its points, another one the others: a quarter of the time
@@ -43,19 +42,20 @@ class SeenFrames:
         self._every = 1
         self._count = 0
 
-    def chosen(self, fit: Fit, matched: bool) -> Matches | None:
-        """What is wanted of the next settled frame, if anything; matched: against the map, so that it saw all it can.
+    def chosen(self, seen: Matches, matched: bool) -> Matches | None:
+        """What is wanted of the next settled frame, if anything; seen: the points it sees; matched: against the map, so
+        that it saw all it can.
 
         One that saw little is not kept: what it gives would not do for a pose.
         """
         turns = _TURNS if matched else 1
-        if len(fit.matches) < turns * FEW:
+        if len(seen) < turns * FEW:
             return None
         number, self._count = self._count, self._count + 1
         if number % self._every:
             return None
         turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
-        return fit.matches.take((fit.matches.points + turn) % turns == 0)
+        return seen.take((seen.points + turn) % turns == 0)
 
     def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
         """What was chosen of the frame in a row of the log, after those before it, and its corners."""

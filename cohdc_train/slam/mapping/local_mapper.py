@@ -3,10 +3,10 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from typing import Protocol
 
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.geometry.depth_image import Picture
-from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
 from cohdc_train.slam.mapping.background_bundle_adjustment import BackgroundMapper
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
@@ -17,11 +17,28 @@ from cohdc_train.slam.mapping.patch_refiner import Refiner
 from cohdc_train.slam.optimization.reprojection import Weighing
 
 
+class LoopCloserLike(Protocol):
+    """Closer of loops among the keyframes of a map."""
+
+    closed: int
+
+    @property
+    def ends(self) -> set[int]:
+        """Indices of the keyframes that loops refer to."""
+
+    def close(self, keyframe: Keyframe, picture: Picture) -> bool:
+        """Look for a loop with the newest keyframe. Returns whether the map moved."""
+
+    def forget(self, keyframe: Keyframe) -> None:
+        """Forget a keyframe that the map gave up."""
+
+
 class LocalMapping:
     """Takes keyframes into a map and puts it in order.
 
-    refiner: cuts out the patches of new points; executor: where bundle adjustment runs, beside tracking
-    (`background_mapping`), without one it is waited for; in_parts: what can wait is done by `work`, a part at a time.
+    refiner: cuts out the patches of new points; loop_closer: closes loops with every keyframe, None closes none;
+    executor: where bundle adjustment runs, in parallel with tracking (`background_bundle_adjustment`), None waits for
+    it; in_parts: what can wait is done by `work`, a part at a time.
     """
 
     def __init__(
@@ -30,14 +47,14 @@ class LocalMapping:
         weighing: Weighing,
         method: Method,
         refiner: Refiner | None,
-        seed: int,
+        loop_closer: LoopCloserLike | None,
         executor: Executor | None,
         in_parts: bool,
     ) -> None:
         self._world, self._weighing = world, weighing
         self._mapper = None if executor is None else BackgroundMapper(executor, weighing)
         self._refiner = refiner
-        self._loops = LoopCloser(world, weighing, seed) if method.loops else None
+        self._loops = loop_closer
         self._culls_keyframes = method.keyframe_culling
         self._in_parts = in_parts
         self._parts: deque[Callable[[], None]] = deque()

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
+from cohdc_train.slam.config import ACCELERATION, LONGEST, SHORTEST
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
-from cohdc_train.slam.tracking.motion_model import ACCELERATION, LONGEST, SHORTEST
 
 _SHARED = 2e-3  # m and rad: error of a frame that its information does not know of
 _LEAST = 1.0  # 1/m^2 and 1/rad^2: information of a frame that saw nothing

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cohdc_train.slam.config import ACCELERATION, FEW, LONGEST, SHORTEST
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
 from cohdc_train.slam.optimization.reprojection import Prior
 
-ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard deviation
 _UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known
 _EXACT = np.full(6, 1e-4)  # m and rad: no pose is known better, however many points say so
-LONGEST = 0.2  # s between two frames whose velocity still says where the camera was in between
-SHORTEST = 1e-3  # s: two frames of one stamp say nothing of the velocity
 _PAUSE = 10.0  # s, after which nothing more is forgotten
-FEW = 150  # points of a frame, below which it matters where the camera was expected
 _LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
 _NOTHING = np.zeros(6)
 _SURPRISE = 100.0  # squared standard deviations of a pose, from which on it is a leap

@@ -19,6 +19,7 @@ from cohdc_train.slam.frame import OnPose, Pose
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.depth_image import take_picture
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse
+from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
 from cohdc_train.slam.mapping.frame_history import FrameLog
 from cohdc_train.slam.mapping.global_bundle_adjustment import SeenFrames
 from cohdc_train.slam.mapping.keyframe import Keyframe
@@ -87,7 +88,10 @@ class Tracker:
         self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
         self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
         in_parts = self._flow is not None
-        self._mapping = LocalMapping(self.map, self._weighing, self.method, self._refiner, seed, executor, in_parts)
+        loop_closer = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
+        self._mapping = LocalMapping(
+            self.map, self._weighing, self.method, self._refiner, loop_closer, executor, in_parts
+        )
         self._spent = spent
         self._motion = Motion()
         self._last: Fit | None = None
@@ -283,8 +287,8 @@ class Tracker:
             return
         self._last = fit
         self._since_keyframe += 1
-        row = self._log.append(frame.t, fit, self.map)
-        chosen = self._seen.chosen(fit, matched) if self.method.every_frame else None
+        row = self._log.append(frame.t, fit.T_cw, fit.reference, fit.information, fit.pull, self.map)
+        chosen = self._seen.chosen(fit.matches, matched) if self.method.every_frame else None
         if chosen is None:
             return
         assert self.features is not None
