@@ -20,7 +20,12 @@ from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.budget import FitTrainer, default_epochs, is_bounded, training_limits, validation_interval
 from cohdc_train.train.ema import ema
-from cohdc_train.train.initial_weights import InitialWeights, choose_initial_weights, resolve_network
+from cohdc_train.train.initial_weights import (
+    InitialWeights,
+    choose_initial_weights,
+    resolve_backbone_lr,
+    resolve_network,
+)
 from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.pictures import ValidationPictures
 from cohdc_train.train.progress import ProgressReporter
@@ -126,9 +131,10 @@ class FitCommand(LightningCLI):
             raise CohdcError(f"{checkpoint}: no such file")
         network = self.config["model"]["network"]
         self.initial = choose_initial_weights(self.config["pretrained"], network, checkpoint)
-        if self.initial.kind != "resumed":
-            for name, value in resolve_network(self.initial, network).items():
-                network[name] = value
+        for name, value in resolve_network(self.initial, network).items():
+            network[name] = value
+        optimizer = self.config["model"]["optimizer"]
+        optimizer["backbone_lr"] = resolve_backbone_lr(self.initial, optimizer["backbone_lr"])
 
     def instantiate_classes(self) -> None:
         """Build data, network and trainer; a value that one of them refuses is the user's error."""
