@@ -36,8 +36,8 @@ class SourceImage:
 
     Attributes:
         path: its file, absolute; with `pixels`, the name it would have.
-        width, height: px, of the picture that the objects are drawn on.
-        upright: that picture is the file's turned as its EXIF says.
+        width, height: px, of the image that the objects are drawn on.
+        upright: that image is the file's, turned as its EXIF says.
         pixels: gives the file's bytes where they are inside the annotation file.
         objects: what is annotated.
     """
@@ -118,21 +118,19 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceImage:
     """The image of a file, without objects. annotated: (width, height), px, where the format tells it.
 
-    Annotation tools show a picture turned as its EXIF says, so that is what the objects are drawn on, unless the
-    annotated size is that of the unturned pixels only.
+    Annotation tools show the upright image, so that is what the objects are drawn on, unless the
+    annotated size is that of the stored pixels only.
     Raises DataError naming the file when it cannot be read or is of another size.
     """
     file = look(path)
     if file.problem:
         raise DataError(f"{path}: {PROBLEMS[file.problem]}")
-    stored = (file.width, file.height)
     path = Path(os.path.abspath(path))
-    shown = stored[::-1] if file.turned else stored
-    if annotated in (None, shown):
-        return SourceImage(path, *shown, upright=file.oriented)
-    if annotated == stored:
-        return SourceImage(path, *stored)
-    raise DataError(f"{path}: is {stored[0]}x{stored[1]}, its annotation {annotated[0]}x{annotated[1]}")
+    width, height = file.size_for(annotated)
+    if annotated not in (None, (width, height)):
+        found = f"is {width}x{height}"
+        raise DataError(f"{path}: {found}, its annotation {annotated[0]}x{annotated[1]}")
+    return SourceImage(path, width, height, upright=file.is_turned(annotated))
 
 
 def numbers(values: Any, count: int | None = None) -> list[float]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps
+from PIL import Image
 
 from cohdc_train.data.formats import (
     Source,
@@ -25,8 +25,10 @@ from cohdc_train.data.formats import (
     open_image,
     rectangle,
 )
+from cohdc_train.data.image_files import ImageFile
 from cohdc_train.data.layout import load_json
 from cohdc_train.errors import DataError
+from cohdc_train.images import orientation_of
 
 _NEEDS = {
     "polygon": "points [[x, y], ...]",
@@ -61,23 +63,25 @@ def _read_file(path: Path, source: Source) -> SourceImage:
 def _image(path: Path, content: dict[str, Any]) -> SourceImage:
     """The image beside the JSON, else the one inside it."""
     size = (content.get("imageWidth"), content.get("imageHeight"))
-    annotated = None if None in size else size
+    annotated: Any = None if None in size else size
     name = str(content.get("imagePath") or "").replace("\\", "/")
     for file in (path.parent / name, path.parent / Path(name).name):
         if name and os.path.isfile(file):  # False for a name too long for a file
-            return open_image(file, annotated)  # type: ignore[arg-type]
+            return open_image(file, annotated)
     if not content.get("imageData"):
         raise DataError(f"{path}: imagePath {name!r} does not exist, and there is no imageData")
     try:
         with Image.open(io.BytesIO(_embedded(path, content))) as picture:
-            oriented = picture.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
-            shown = ImageOps.exif_transpose(picture).size
+            inside = ImageFile(picture.size, orientation_of(picture))
             file = path.with_suffix(".png" if picture.format == "PNG" else ".jpg")
     except (OSError, TypeError, ValueError) as error:
         raise DataError(f"{path}: imageData cannot be read as an image") from error
-    if annotated not in (None, shown):
-        raise DataError(f"{path}: imageData is {shown[0]}x{shown[1]}, the annotation {size[0]}x{size[1]}")
-    return SourceImage(Path(os.path.abspath(file)), *shown, upright=oriented, pixels=functools.partial(_embedded, path))
+    width, height = inside.size_for(annotated)
+    if annotated not in (None, (width, height)):
+        found = f"imageData is {width}x{height}"
+        raise DataError(f"{path}: {found}, the annotation {size[0]}x{size[1]}")
+    name, pixels = os.path.abspath(file), functools.partial(_embedded, path)
+    return SourceImage(Path(name), width, height, inside.is_turned(annotated), pixels)
 
 
 def _embedded(path: Path, content: dict[str, Any] | None = None) -> bytes:
