@@ -25,6 +25,7 @@ from cohdc_train.data.formats import (
     open_image,
     rectangle,
 )
+from cohdc_train.data.formats_splits import TEST, settle_splits, split_of
 from cohdc_train.data.image_files import ImageFile
 from cohdc_train.data.layout import load_json
 from cohdc_train.errors import DataError
@@ -42,22 +43,27 @@ def read_labelme(root: Path) -> Source:
     """A folder of images and labelme's JSON files, or one such file.
 
     Polygons, rectangles, circles and masks become objects, those with the same label and `group_id` one object;
-    shapes of other types are left out and counted, and so are images without a JSON.
+    shapes of other types are left out and counted, and so are images without a JSON. Folders named
+    train, val and test are the source's own split.
     Raises DataError in one line naming the file and the shape.
     """
     source = Source()
-    for split, files in annotation_files(root).items():
-        source.splits[split] = [_read_file(path, source) for path in files]
+    for path in annotation_files(root):
+        _read_file(root, path, source)
     leave_out_strays(root, source, "image without a JSON file")
+    settle_splits(root, source)
     return source
 
 
-def _read_file(path: Path, source: Source) -> SourceImage:
+def _read_file(root: Path, path: Path, source: Source) -> None:
+    """Add the image of one JSON file; its objects too, unless it is of the test split."""
     content = load_json(path)
     if not isinstance(content, dict) or not isinstance(content.get("shapes"), list):
         raise DataError(f"{path}: not labelme's: no list 'shapes'")
     image = _image(path, content)
-    return image.holding(_objects(path, content["shapes"], image, source))
+    split = split_of(root, path, image.path)
+    objects = [] if split == TEST else _objects(path, content["shapes"], image, source)
+    source.add(split, image.holding(objects))
 
 
 def _image(path: Path, content: dict[str, Any]) -> SourceImage:
