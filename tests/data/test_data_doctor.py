@@ -134,7 +134,7 @@ def check_mended(folder: Path, root: Path) -> None:
     code, found = findings(linked)
     assert code == 0
     still = {kind for split in found.values() for kind in split if KINDS[kind].severity == "warning"}
-    assert still <= {"image-exif", "image-colour", "category-unused", "class-only-val"}
+    assert still <= {"image-colour", "category-unused", "class-only-val"}
 
 
 def test_the_mend_never_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
