@@ -27,6 +27,7 @@ from cohdc_train.train.initial_weights import (
     resolve_network,
 )
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.train.out_folder import check_out, claim_out
 from cohdc_train.train.pictures import ValidationPictures
 from cohdc_train.train.progress import ProgressReporter
 from cohdc_train.train.sanity import find_learning_rate, overfit_verdict
@@ -129,6 +130,7 @@ class FitCommand(LightningCLI):
         checkpoint: Path | None = self.config["ckpt_path"]
         if checkpoint is not None and not checkpoint.is_file():
             raise CohdcError(f"{checkpoint}: no such file")
+        check_out(self.config)
         network = self.config["model"]["network"]
         self.initial = choose_initial_weights(self.config["pretrained"], network, checkpoint)
         for name, value in resolve_network(self.initial, network).items():
@@ -184,6 +186,7 @@ class FitCommand(LightningCLI):
 
     def run(self) -> None:
         """Train, from the initial weights or where `--ckpt_path` ended, and say how it went."""
+        claim_out(self.config)
         rank_zero_info(self.initial.describe(_num_images(self.datamodule)))
         if self.initial.kind == "network":
             left = self.model.take_over(model_path(self.initial.source))

@@ -145,6 +145,21 @@ def test_the_mend_never_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.
     assert (root / "instances_train.json").read_bytes() == before
 
 
+@pytest.mark.parametrize("option", ["--fix", "--out"])
+@pytest.mark.parametrize("name", ["instances_val.json", "findings.json"])
+def test_doctor_keeps_files_it_did_not_write(
+    tmp_path: Path, option: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, out = toys.folder(tmp_path / "a"), tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("mine")
+    is_refused = (option == "--fix") == (name == "instances_val.json")
+    assert main(["data", "doctor", str(root), option, str(out)]) == is_refused
+    assert (f"holds {name}, not written" in capsys.readouterr().err) == is_refused
+    assert main(["data", "doctor", str(root), option, str(out)]) == is_refused, "the second time"
+    assert (out / name).read_text() == "mine"
+
+
 def test_a_class_that_only_validation_has_objects_of(tmp_path: Path) -> None:
     root = toys.folder(tmp_path / "a")
     content = json.loads((root / "instances_train.json").read_text())
