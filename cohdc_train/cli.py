@@ -36,7 +36,7 @@ VERBS = {
 # fmt: off
 _TRAIN_PACKAGES = frozenset({
     "torch", "torchvision", "lightning", "pycocotools", "faster_coco_eval", "onnx", "onnxscript", "onnxslim", "kornia",
-    "rich", "tensorboard", "embreex", "shapely", "PIL",
+    "rich", "tensorboard", "embreex", "shapely",
 })
 # fmt: on
 

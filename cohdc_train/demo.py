@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.files import write_json
+from cohdc_train.files import check_folder, files_below, list_files, remove_listed, write_json
 
 _MARK = "demo.json"  # written first, so that a later run knows the folder as its own
+_FOLDERS = ("data", "sequence", "train", "without", "with", "predictions")
+_FILES = (_MARK, "model.onnx", "model.onnx.json", "report.html", "summary.json")
 _OVERLAYS = 6
 
 
@@ -36,16 +38,20 @@ QUICK = Plan(train_images=160, val_images=24, frames=120, epochs=8)
 
 @dataclass
 class Clock:
-    """Prints what is being done and keeps how long each step took, s."""
+    """Prints what is being done and keeps how long each step took, s. out: the demo's folder."""
 
+    out: Path
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Time the block under `name`."""
+        """Time the block under `name`, and list the files that it leaves, however it ends."""
         print(f"== {name}", flush=True)
         started = time.monotonic()
-        yield
+        try:
+            yield
+        finally:
+            list_files(self.out, "demo", _files_of(self.out))
         self.seconds[name] = round(time.monotonic() - started, 1)
 
 
@@ -56,7 +62,7 @@ def demo(out: Path = Path("runs/demo"), quick: bool = False, seed: int = 0) -> d
     summary.json (segm_ap50, ate_without_m, ate_with_m, coverage, seconds). Everything is rendered; nothing is fetched.
 
     Args:
-        out: new or empty folder, or that of a former demo, which is replaced.
+        out: new or empty folder, or that of a former demo, whose files are replaced.
         quick: a fraction of the images, frames and epochs; scores are worse.
         seed: of rendering, training and SLAM; the same seed gives the same numbers on the same machine.
 
@@ -65,7 +71,7 @@ def demo(out: Path = Path("runs/demo"), quick: bool = False, seed: int = 0) -> d
     """
     plan = QUICK if quick else FULL
     _claim(out, plan, seed)
-    clock = Clock()
+    clock = Clock(out)
     with clock.step("render"):
         _render(out, plan, seed)
     with clock.step("train"):
@@ -110,15 +116,21 @@ def table(summary: dict[str, Any], out: Path) -> str:
 
 
 def _claim(out: Path, plan: Plan, seed: int) -> None:
-    """Make the folder ready; what a former demo left there goes, anything else is refused."""
+    """Remove what a former demo left; raise CohdcError when anything else is in its place."""
     if out.exists() and not out.is_dir():
         raise CohdcError(f"{out}: is not a folder")
-    if out.is_dir() and any(out.iterdir()):
-        if not (out / _MARK).is_file():
-            raise CohdcError(f"{out}: not empty and not from a former demo; give another --out")
-        shutil.rmtree(out)
-    out.mkdir(parents=True, exist_ok=True)
+    if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
+        raise CohdcError(f"{out}: not empty and not from a former demo; give another --out")
+    check_folder(out, "demo", _files_of(out))
+    remove_listed(out, "demo")
+    list_files(out, "demo", _FILES)
     write_json(out / _MARK, {"plan": vars(plan), "seed": seed})
+
+
+def _files_of(out: Path) -> list[str]:
+    """Names of the files that lie where a demo writes, relative to its folder."""
+    files = [name for name in _FILES if (out / name).exists()]
+    return files + [f"{name}/{file}" for name in _FOLDERS for file in files_below(out / name)]
 
 
 def _render(out: Path, plan: Plan, seed: int) -> None:
@@ -184,7 +196,7 @@ def _report(out: Path, scores: dict[str, float], clock: Clock) -> None:
 
     frames = sorted((out / "sequence" / "rgb").iterdir())
     chosen = out / "predictions" / "frames"
-    chosen.mkdir(parents=True)
+    chosen.mkdir(parents=True, exist_ok=True)
     for frame in frames[:: max(1, len(frames) // _OVERLAYS)][:_OVERLAYS]:
         shutil.copy(frame, chosen / frame.name)
     predict(chosen, model=out / "model.onnx", out=out / "predictions")

@@ -11,11 +11,11 @@ from cohdc_train.errors import CohdcError
 
 BASE = (
     *("numpy", "opencv-python-headless", "onnxruntime", "jsonargparse", "pyyaml", "scipy", "threadpoolctl"),
-    "matplotlib",
+    *("matplotlib", "pillow"),
 )
 TRAIN = (
     *("torch", "torchvision", "lightning", "pycocotools", "faster-coco-eval", "onnx", "onnxscript", "onnxslim"),
-    *("kornia", "rich", "tensorboard", "embreex", "shapely", "pillow"),
+    *("kornia", "rich", "tensorboard", "embreex", "shapely"),
 )
 MALICIOUS = {"lightning": ("2.6.2", "2.6.3")}  # GHSA-w37p-236h-pfx3
 

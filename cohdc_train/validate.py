@@ -11,14 +11,14 @@ from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoSplit
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
-from cohdc_train.files import write_json
+from cohdc_train.files import check_folder, claim_folder, write_json
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.cli import told_in_one_line
 from cohdc_train.train.metrics import Results, SegmentationMetrics, category_names
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.pictures import draw_validation, write_files
+from cohdc_train.train.pictures import VALIDATION_FILES, draw_validation, write_files
 
 
 def validate(
@@ -53,6 +53,8 @@ def validate(
         CohdcError: the model, the folder or their classes cannot be used.
     """
     keep_freed_memory()
+    if pictures is not None:
+        check_folder(pictures, "validate", VALIDATION_FILES, "--pictures")
     model = model_path(model)
     if model.suffix == ".onnx":
         if canvas is not None:
@@ -68,6 +70,7 @@ def validate(
         out.parent.mkdir(parents=True, exist_ok=True)
         write_json(out, results.scores)
     if pictures is not None:
+        claim_folder(pictures, "validate", VALIDATION_FILES, "--pictures")
         split = CocoDataModule(root, category_names(results.truth)).folder.val
         write_files(pictures, draw_validation(results, split.images))
     return results.scores

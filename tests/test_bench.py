@@ -113,6 +113,13 @@ def _renamed(folder, name):
     return str(folder / name)
 
 
+def test_bench_keeps_a_table_it_did_not_write(tmp_path):
+    (tmp_path / "table4.csv").write_text("mine")
+    with pytest.raises(CohdcError, match=r"holds table4\.csv, not written by a former cohdc bench"):
+        bench(tmp_path, out=tmp_path, rows=[], models=[tmp_path / "absent.onnx"], epochs=1)
+    assert (tmp_path / "table4.csv").read_text() == "mine"
+
+
 def test_unknown_rows_and_files_are_one_line(tmp_path):
     with pytest.raises(CohdcError, match="no row 'VGG'; there are HDC-Net, ResNet50, ResNet101, MobileNetV1"):
         bench(tmp_path, out=tmp_path / "o", rows=["VGG"], epochs=1)

@@ -9,6 +9,7 @@ from cohdc_train import demo as demo_module
 from cohdc_train.cli import main
 from cohdc_train.demo import Plan, demo
 from cohdc_train.errors import CohdcError
+from cohdc_train.files import MANIFEST, files_below
 from cohdc_train.trajectory import read_tum
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
@@ -67,3 +68,30 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path):
     with pytest.raises(CohdcError, match="not from a former demo"):
         demo(tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_users_demo_json_does_not_give_the_folder_away(tmp_path):
+    (tmp_path / "demo.json").write_text("mine")
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(CohdcError, match=r"holds demo\.json, not written by a former cohdc demo"):
+        demo(tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+    assert (tmp_path / "demo.json").read_text() == "mine"
+
+
+def test_second_demo_removes_only_the_files_of_the_first(tmp_path, monkeypatch):
+    def stop(out, *_):
+        (out / "data" / "images").mkdir(parents=True)
+        (out / "data" / "images" / "a.png").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo_module, "_render", stop)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            demo(tmp_path)
+        (tmp_path / "thesis.txt").write_text("years of work")
+    (tmp_path / "data" / "mine.png").write_text("mine")
+    with pytest.raises(CohdcError, match=r"holds data/mine\.png, not written"):
+        demo(tmp_path)
+    names = ["data/images/a.png", "data/mine.png", "demo.json", "thesis.txt"]
+    assert [name for name in files_below(tmp_path) if name != MANIFEST] == names

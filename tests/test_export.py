@@ -174,6 +174,21 @@ def test_a_hundred_detections_in_one_image(opinionated, tmp_path):
     assert _report(export(tmp_path / "many.ckpt"))["most_detections"] == 100
 
 
+@pytest.mark.parametrize("name", ["m.onnx", "m.onnx.json", "m.int8.onnx"])
+def test_export_keeps_files_it_did_not_write(checkpoint, tmp_path, name):
+    content = '{"file": "another.onnx"}'
+    (tmp_path / name).write_text(content)
+    with pytest.raises(CohdcError, match=r"is not of a former cohdc export; give another --out"):
+        export(checkpoint, tmp_path / "m.onnx", int8=tmp_path, allow_drop=True)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: content}
+
+
+def test_export_replaces_its_own_file(checkpoint, written, tmp_path):
+    file = export(checkpoint, tmp_path / "m.onnx")
+    first = _report(file)
+    assert _report(export(checkpoint, file))["checkpoint_sha256"] == first["checkpoint_sha256"]
+
+
 def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, monkeypatch):
     """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the folder."""
 

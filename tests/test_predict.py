@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.contour import Polygon, rasterize
 from cohdc_train.errors import ContractError, DataError
+from cohdc_train.files import MANIFEST
 from cohdc_train.predict import predict, predict_pictures
 from cohdc_train.predict.drawing import draw
 from cohdc_train.predict.pictures import Picture, read_pictures
@@ -52,6 +53,7 @@ def test_coco_file_holds_what_was_found(tmp_path: Path) -> None:
     assert second["score"] == pytest.approx(0.6)
     assert second["quality"] == pytest.approx(0.3)
     assert sorted(file.name for file in (tmp_path / "new" / "out").iterdir()) == [
+        MANIFEST,
         "a_overlay.jpg",
         "b_overlay.jpg",
         "predictions.json",

@@ -13,6 +13,7 @@ from conversion import converted, iou, masks_of
 from test_predict import Fake, picture
 
 from cohdc_train.errors import DataError
+from cohdc_train.files import files_below
 from cohdc_train.predict import predict, predict_pictures
 from cohdc_train.predict.pictures import Picture, read_pictures
 
@@ -129,3 +130,41 @@ def test_fewer_vertices_make_smaller_files(tmp_path: Path, format: Any) -> None:
         files = [file for file in folder.rglob("*") if file.suffix in (".json", ".txt") and file.name != "review.txt"]
         sizes[floor] = sum(file.stat().st_size for file in files)
     assert sizes[0.9] < sizes[1.0]
+
+
+@pytest.mark.parametrize(
+    ("format", "name"),
+    [
+        ("coco", "predictions.json"),
+        ("coco", "a_overlay.jpg"),
+        ("labelme", "review.txt"),
+        ("yolo", "data.yaml"),
+        ("yolo", "labels/a.txt"),
+    ],
+)
+def test_prediction_keeps_files_it_did_not_write(tmp_path: Path, format: Any, name: str) -> None:
+    file = tmp_path / "out" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("mine")
+    with pytest.raises(DataError, match=r"holds .*, not written by a former cohdc predict"):
+        written(tmp_path / "out", photographs(tmp_path / "photos"), format=format)
+    assert files_below(tmp_path / "out") == [name]
+    assert file.read_text() == "mine"
+
+
+def test_second_prediction_replaces_its_files_and_keeps_labels_added_since(tmp_path: Path) -> None:
+    pictures = photographs(tmp_path / "photos")
+    for format in ("coco", "yolo"):
+        out = tmp_path / format
+        written(out, pictures[:1], format=format)
+        written(out, pictures[:2], format=format)
+    (out / "labels" / "c.txt").write_text("mine")
+    with pytest.raises(DataError, match=r"c\.txt: is there already, by somebody else"):
+        written(out, pictures, format="yolo")
+    assert (out / "labels" / "c.txt").read_text() == "mine"
+
+
+def test_yolo_labels_go_beside_images_that_are_there(tmp_path: Path) -> None:
+    pictures = photographs(tmp_path / "images")
+    written(tmp_path, pictures, format="yolo")
+    assert len(files_below(tmp_path / "labels")) == 4

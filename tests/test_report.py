@@ -151,6 +151,17 @@ def test_the_verb_finds_the_ground_truth_of_the_run_and_compares(tmp_path: Path)
     assert "Absolute trajectory error over time" in page.heads
 
 
+def test_report_keeps_a_page_it_did_not_write(tmp_path: Path) -> None:
+    ours = run_folder(tmp_path / "run", 0.001)
+    (ours / "config.yaml").write_text("sequence: nowhere")
+    (ours / "report.html").write_text("mine")
+    with pytest.raises(DataError, match=r"holds report\.html, not written by"):
+        report(ours)
+    assert (ours / "report.html").read_text() == "mine"
+    (ours / "report.html").unlink()
+    assert report(ours).read_bytes() == report(ours).read_bytes()
+
+
 def test_a_run_without_ground_truth_has_its_trajectory_all_the_same(tmp_path: Path) -> None:
     ours = run_folder(tmp_path / "live", 0.001)
     (ours / "config.yaml").write_text("sequence: nowhere")

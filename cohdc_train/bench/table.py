@@ -17,9 +17,10 @@ from cohdc_train.bench.speed import Rate, frame_rates, peak_memory, runners_of, 
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
-from cohdc_train.files import write_bytes, write_json, write_text
+from cohdc_train.files import claim_folder, write_bytes, write_json, write_text
 
 Row = dict[str, Any]
+_FILES = ("table4.json", "table4.csv", "table4.txt", "table4.png", "picture.npy")
 _RATES = ("fps_torch", "fps_ort", "fps_ort_int8")
 _COLUMNS = {
     "name": "network",
@@ -62,7 +63,7 @@ def run(
     names = {Path(row).stem: row for row in wanted}
     if len(names) < len(wanted):
         raise CohdcError(f"rows {', '.join(wanted)}: two have the same name")
-    out.mkdir(parents=True, exist_ok=True)
+    claim_folder(out, "bench", _FILES)
     entries: dict[str, list[Entry]] = {}
     for seed in seeds:  # seed by seed, so that an interrupted bench has every row at few seeds
         for name, row in names.items():

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as rle
 
 from cohdc_train.data.image_files import check_size
 from cohdc_train.errors import DataError
+from cohdc_train.images import read_rgb, size_of
 
 _FAR = 1e5  # px from which a coordinate is a mistake; pycocotools draws such polygons point by point until memory ends
 _CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
@@ -63,15 +63,18 @@ class CocoImage:
 
 
 def read_image(image: CocoImage) -> NDArray[np.uint8]:
-    """[height, width, 3] uint8 RGB. EXIF orientation is ignored, as COCO's annotations do.
+    """Return the image as it was annotated, [height, width, 3] uint8 RGB.
 
+    It is upright, turned by its EXIF orientation, unless the annotated size is that of the stored
+    pixels only.
     Raises DataError naming file and id when it cannot be decoded or its size is not the annotated one.
     """
-    pixels = cv2.imread(str(image.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    annotated = (image.width, image.height)
+    pixels = read_rgb(image.path, annotated)
     if pixels is None:
         raise DataError(f"{image.path}: image {image.id} cannot be read as an image")
-    check_size(image.path, image.id, pixels.shape[1::-1], (image.width, image.height))
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    check_size(image.path, image.id, size_of(pixels), annotated)
+    return pixels
 
 
 def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:

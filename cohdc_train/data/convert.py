@@ -49,6 +49,7 @@ def convert(
         source: the folder, or the annotation file.
         out: the folder to write, absent or empty.
         val: share of the images that go to validation, where the source has no split of its own.
+            Images in folders (or of lists) named test are left out and counted.
         seed: of the shuffle that chooses them; the same images for the same seed.
         attribute: via: the region attribute that holds the class, where there are several.
         names: voc: file with a class per line, or CVAT's labelmap.txt. via: file with the one class of all regions.
@@ -67,7 +68,9 @@ def convert(
                 )
             write_text(draft / f"instances_{name}.json", json.dumps(content))
         written = [_read_back(draft, name, out) for name in splits]
-    print("split: " + (f"drawn, --val {val} --seed {seed}" if "" in found.splits else "the source's own"))
+    drawn = "drawn" + (f" from {found.drawn_from}" if found.drawn_from else "")
+    own = "the source's own"
+    print("split: " + (f"{drawn}, --val {val} --seed {seed}" if "" in found.splits else own))
     print("\n".join(summary(split) for split in written))
     _print_counts("left out", found.left_out)
     _print_counts("worth knowing", found.notes)

@@ -15,9 +15,10 @@ from cohdc_train.data.image_files import mirrored
 from cohdc_train.data.inspection import Inspection, inspect
 from cohdc_train.data.layout import find_split
 from cohdc_train.errors import DataError
-from cohdc_train.files import write_json
+from cohdc_train.files import claim_folder, write_json
 from cohdc_train.presets import config_path
 
+_VERB = "data doctor"
 _SPLITS = ("train", "val")
 _SAME_PICTURE = 0.97  # product of two fingerprints; unrelated photographs reach .9
 _SHOWN = 24  # counts of a split; `stats` prints all of them
@@ -53,7 +54,7 @@ def doctor(
         _write_mended(splits, fix)
     wrong = {split.name: split.findings.of("error") for split in splits}
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
+        claim_folder(out, _VERB, ["findings.json", "annotations.jpg"])
         write_json(out / "findings.json", {split.name: split.findings.places for split in splits})
     count_of = sum(len(where) for kinds in wrong.values() for where in kinds.values())
     if count_of:
@@ -128,12 +129,13 @@ def _compare(train: Inspection, val: Inspection) -> None:
 
 def _write_mended(splits: Sequence[Inspection], folder: Path) -> None:
     """Write the mended files and say how to train on them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    options = []
-    for split in splits:
-        path = folder / f"instances_{split.name}.json"
+    paths = [folder / f"instances_{split.name}.json" for split in splits]
+    for split, path in zip(splits, paths, strict=True):
         if path.exists() and path.samefile(split.files.annotations):
             raise DataError(f"{path}: --fix would overwrite the file it reads; give another folder")
+    claim_folder(folder, _VERB, [*(path.name for path in paths), "removed.json"], "--fix")
+    options = []
+    for split, path in zip(splits, paths, strict=True):
         write_json(path, split.content)
         options += [f"--data.paths.{split.name}_json {path} --data.paths.{split.name}_images {split.files.images}"]
     write_json(folder / "removed.json", {split.name: split.removed for split in splits})

@@ -40,12 +40,18 @@ KINDS: dict[str, Kind] = {
     "image-corrupt": Kind("error", "image file cannot be read as an image", "fetch it again; --fix leaves it out"),
     "image-truncated": Kind("error", "image file ends early", "fetch it again; --fix leaves it out"),
     "image-turned": Kind(
-        "error", "annotated as shown turned by EXIF", "turn the pixels, drop the EXIF tag; --fix leaves it out"
+        "note",
+        "image turned upright by its EXIF orientation when it is read",
+        "none needed, unless it was annotated unturned: look at it with --out",
     ),
     "image-size": Kind(
         "error", "width or height is not the file's", "--fix takes the file's where the contours fit into it"
     ),
-    "image-exif": Kind("warning", "EXIF says turned; the annotation is of the unturned pixels", "look at it"),
+    "image-exif": Kind(
+        "note",
+        "EXIF says turned; the annotation is of the stored pixels, so the image is not turned",
+        "none needed, unless it was annotated upright: look at it with --out",
+    ),
     "image-colour": Kind("warning", "neither 8-bit grey, palette nor RGB (CMYK, 16 bit)", "convert it to 8-bit RGB"),
     "image-huge": Kind("note", "image above 24 megapixels", "none needed; a smaller copy is read faster"),
     "image-empty": Kind("note", "image without objects", "none needed: it teaches what is background"),

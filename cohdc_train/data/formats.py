@@ -15,7 +15,6 @@ from cohdc_train.data.image_files import PROBLEMS, look
 from cohdc_train.errors import DataError
 
 IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
-_SPLIT_FOLDERS = {"train": "train", "val": "val", "valid": "val"}
 _SAGITTA = 0.05  # px by which an arc may leave the chord that stands for it
 
 
@@ -36,8 +35,8 @@ class SourceImage:
 
     Attributes:
         path: its file, absolute; with `pixels`, the name it would have.
-        width, height: px, of the picture that the objects are drawn on.
-        upright: that picture is the file's turned as its EXIF says.
+        width, height: px, of the image that the objects are drawn on.
+        upright: that image is the file's, turned as its EXIF says.
         pixels: gives the file's bytes where they are inside the annotation file.
         objects: what is annotated.
     """
@@ -60,15 +59,22 @@ class Source:
 
     Attributes:
         splits: "train" and "val" -> images; or only "" when the source has no split of its own.
+            While it is read also "test", until `settle_splits` leaves that out.
+        drawn_from: what a split is drawn from, where that is not the whole source.
         class_names: in the format's own order; None where it has none.
         left_out: why -> where, of what is not converted.
         notes: what -> where, of what is converted but not as it was.
     """
 
     splits: dict[str, list[SourceImage]] = field(default_factory=dict)
+    drawn_from: str = ""
     class_names: tuple[str, ...] | None = None
     left_out: dict[str, list[str]] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
+
+    def add(self, split: str, image: SourceImage) -> None:
+        """Append an image to a split; "" where nothing tells its split."""
+        self.splits.setdefault(split, []).append(image)
 
     def leave_out(self, why: str, where: str) -> None:
         """Count one thing that is not converted."""
@@ -79,21 +85,17 @@ class Source:
         self.notes.setdefault(what, []).append(where)
 
 
-def annotation_files(root: Path) -> dict[str, list[Path]]:
-    """Split -> the JSON files of it: a file alone, or all below a folder but those in hidden folders.
+def annotation_files(root: Path) -> list[Path]:
+    """Return the JSON files: a file alone, or all below a folder but those in hidden folders.
 
-    The splits are "train" and "val" where all files lie in folders of these names (`valid` counts as `val`), else
-    there is only "". Raises DataError naming the folder when it is missing or holds no JSON.
+    Raises DataError naming the folder when it is missing or holds no JSON.
     """
     if root.is_file():
-        return {"": [root]}
+        return [root]
     files = _below(root, {".json"})
     if not files:
         raise DataError(f"{root}: {'no JSON file below it' if root.is_dir() else 'no such file or folder'}")
-    splits: dict[str, list[Path]] = {}
-    for path in files:
-        splits.setdefault(_SPLIT_FOLDERS.get(path.relative_to(root).parts[0], ""), []).append(path)
-    return splits if set(splits) == {"train", "val"} else {"": files}
+    return files
 
 
 def leave_out_strays(root: Path, source: Source, why: str) -> None:
@@ -118,21 +120,19 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceImage:
     """The image of a file, without objects. annotated: (width, height), px, where the format tells it.
 
-    Annotation tools show a picture turned as its EXIF says, so that is what the objects are drawn on, unless the
-    annotated size is that of the unturned pixels only.
+    Annotation tools show the upright image, so that is what the objects are drawn on, unless the
+    annotated size is that of the stored pixels only.
     Raises DataError naming the file when it cannot be read or is of another size.
     """
     file = look(path)
     if file.problem:
         raise DataError(f"{path}: {PROBLEMS[file.problem]}")
-    stored = (file.width, file.height)
     path = Path(os.path.abspath(path))
-    shown = stored[::-1] if file.turned else stored
-    if annotated in (None, shown):
-        return SourceImage(path, *shown, upright=file.oriented)
-    if annotated == stored:
-        return SourceImage(path, *stored)
-    raise DataError(f"{path}: is {stored[0]}x{stored[1]}, its annotation {annotated[0]}x{annotated[1]}")
+    width, height = file.size_for(annotated)
+    if annotated not in (None, (width, height)):
+        found = f"is {width}x{height}"
+        raise DataError(f"{path}: {found}, its annotation {annotated[0]}x{annotated[1]}")
+    return SourceImage(path, width, height, upright=file.is_turned(annotated))
 
 
 def numbers(values: Any, count: int | None = None) -> list[float]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps
+from PIL import Image
 
 from cohdc_train.data.formats import (
     Source,
@@ -25,8 +25,11 @@ from cohdc_train.data.formats import (
     open_image,
     rectangle,
 )
+from cohdc_train.data.formats_splits import TEST, settle_splits, split_of
+from cohdc_train.data.image_files import ImageFile
 from cohdc_train.data.layout import load_json
 from cohdc_train.errors import DataError
+from cohdc_train.images import orientation_of
 
 _NEEDS = {
     "polygon": "points [[x, y], ...]",
@@ -40,44 +43,51 @@ def read_labelme(root: Path) -> Source:
     """A folder of images and labelme's JSON files, or one such file.
 
     Polygons, rectangles, circles and masks become objects, those with the same label and `group_id` one object;
-    shapes of other types are left out and counted, and so are images without a JSON.
+    shapes of other types are left out and counted, and so are images without a JSON. Folders named
+    train, val and test are the source's own split.
     Raises DataError in one line naming the file and the shape.
     """
     source = Source()
-    for split, files in annotation_files(root).items():
-        source.splits[split] = [_read_file(path, source) for path in files]
+    for path in annotation_files(root):
+        _read_file(root, path, source)
     leave_out_strays(root, source, "image without a JSON file")
+    settle_splits(root, source)
     return source
 
 
-def _read_file(path: Path, source: Source) -> SourceImage:
+def _read_file(root: Path, path: Path, source: Source) -> None:
+    """Add the image of one JSON file; its objects too, unless it is of the test split."""
     content = load_json(path)
     if not isinstance(content, dict) or not isinstance(content.get("shapes"), list):
         raise DataError(f"{path}: not labelme's: no list 'shapes'")
     image = _image(path, content)
-    return image.holding(_objects(path, content["shapes"], image, source))
+    split = split_of(root, path, image.path)
+    objects = [] if split == TEST else _objects(path, content["shapes"], image, source)
+    source.add(split, image.holding(objects))
 
 
 def _image(path: Path, content: dict[str, Any]) -> SourceImage:
     """The image beside the JSON, else the one inside it."""
     size = (content.get("imageWidth"), content.get("imageHeight"))
-    annotated = None if None in size else size
+    annotated: Any = None if None in size else size
     name = str(content.get("imagePath") or "").replace("\\", "/")
     for file in (path.parent / name, path.parent / Path(name).name):
         if name and os.path.isfile(file):  # False for a name too long for a file
-            return open_image(file, annotated)  # type: ignore[arg-type]
+            return open_image(file, annotated)
     if not content.get("imageData"):
         raise DataError(f"{path}: imagePath {name!r} does not exist, and there is no imageData")
     try:
         with Image.open(io.BytesIO(_embedded(path, content))) as picture:
-            oriented = picture.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
-            shown = ImageOps.exif_transpose(picture).size
+            inside = ImageFile(picture.size, orientation_of(picture))
             file = path.with_suffix(".png" if picture.format == "PNG" else ".jpg")
     except (OSError, TypeError, ValueError) as error:
         raise DataError(f"{path}: imageData cannot be read as an image") from error
-    if annotated not in (None, shown):
-        raise DataError(f"{path}: imageData is {shown[0]}x{shown[1]}, the annotation {size[0]}x{size[1]}")
-    return SourceImage(Path(os.path.abspath(file)), *shown, upright=oriented, pixels=functools.partial(_embedded, path))
+    width, height = inside.size_for(annotated)
+    if annotated not in (None, (width, height)):
+        found = f"imageData is {width}x{height}"
+        raise DataError(f"{path}: {found}, the annotation {size[0]}x{size[1]}")
+    name, pixels = os.path.abspath(file), functools.partial(_embedded, path)
+    return SourceImage(Path(name), width, height, inside.is_turned(annotated), pixels)
 
 
 def _embedded(path: Path, content: dict[str, Any] | None = None) -> bytes:

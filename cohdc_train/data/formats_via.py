@@ -18,6 +18,7 @@ from cohdc_train.data.formats import (
     read_lines,
     rectangle,
 )
+from cohdc_train.data.formats_splits import TEST, settle_splits, split_named, split_of
 from cohdc_train.data.layout import load_json
 from cohdc_train.errors import DataError
 
@@ -35,22 +36,33 @@ def read_via(root: Path, attribute: str | None = None, names: Path | None = None
 
     attribute: the region attribute that holds the class; the only one when there is only one. names: a file with one
     class for all regions, instead. Polylines, points and regions without exactly one class are left out and counted.
+    Folders, or JSON files, named train, val and test are the source's own split.
     Raises DataError in one line naming the file, the image and the region, or the attributes to choose from.
     """
     source = Source()
-    files = annotation_files(root)
-    contents = {path: list(_entries(path)) for paths in files.values() for path in paths}
-    entries = [entry for content in contents.values() for _, entry in content]
+    contents = {path: list(_entries(path)) for path in annotation_files(root)}
+    split_of_file = {path: _split_of_file(root, path) for path in contents}
+    learned = [content for path, content in contents.items() if split_of_file[path] != TEST]
+    entries = [entry for content in learned or contents.values() for _, entry in content]
     chosen, only = _class_attribute(root, entries, attribute, names)
-    for split, paths in files.items():
-        source.splits[split] = []
-        for path in paths:
-            for folder, entry in contents[path]:
-                image = _image(path, folder, str(entry["filename"]))
-                objects = _objects(f"{path}: {entry['filename']}", _regions(entry), chosen, only, source)
-                source.splits[split].append(image.holding(objects))
+    for path, content in contents.items():
+        for folder, entry in content:
+            where = f"{path}: {entry['filename']}"
+            image = _image(path, folder, str(entry["filename"]))
+            split = split_of_file[path] or split_of(root, image.path)
+            if split != TEST:
+                image = image.holding(_objects(where, _regions(entry), chosen, only, source))
+            source.add(split, image)
     leave_out_strays(root, source, "image that no JSON lists")
+    settle_splits(root, source)
     return source
+
+
+def _split_of_file(root: Path, path: Path) -> str:
+    """Return the split that a JSON file, or a folder on the way to it, is named after; else ""."""
+    if path == root:
+        return ""
+    return split_of(root, path) or split_named(path.stem)
 
 
 def _entries(path: Path) -> Iterator[tuple[str, Row]]:

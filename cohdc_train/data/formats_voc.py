@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cohdc_train.data.formats import IMAGE_SUFFIXES, Source, SourceImage, SourceObject, encode, open_image, read_lines
+from cohdc_train.data.formats_splits import TEST, TEST_LEFT_OUT, split_named
 from cohdc_train.errors import DataError
 
 # fmt: off
@@ -35,9 +36,11 @@ class ClassTable(NamedTuple):
 def read_voc(root: Path, names: Path | None = None) -> Source:
     """JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/ with train.txt and val.txt.
 
-    Where there is no such split, trainval.txt or CVAT's default.txt is taken. names: a file with a class per line, or
-    CVAT's labelmap.txt; without it the folder's labelmap.txt, else VOC's 20. An object's class is that of most class
-    pixels under it; 255 is void and belongs to nothing. Class ids keep the order of the names.
+    Where there is no such split, trainval.txt or CVAT's default.txt is taken. The images of
+    test.txt are left out and counted, unless val.txt has them too. names: a file with a class per
+    line, or CVAT's labelmap.txt; without it the folder's labelmap.txt, else VOC's 20. An object's
+    class is that of most class pixels under it; 255 is void and belongs to nothing. Class ids keep
+    the order of the names.
     Raises DataError in one line naming the file and the line.
     """
     table = _class_table(names or (root / "labelmap.txt" if (root / "labelmap.txt").is_file() else None))
@@ -47,24 +50,46 @@ def read_voc(root: Path, names: Path | None = None) -> Source:
         for path in sorted((root / "JPEGImages").rglob("*"))
         if path.suffix.lower() in IMAGE_SUFFIXES
     }
-    for split, listed in _lists(root).items():
+    lists = _lists(root)
+    tests = _leave_out_test(lists, source)
+    for split, listed in lists.items():
         source.splits[split] = []
         for number, stem in read_lines(listed):
             if stem not in pictures:
                 raise DataError(f"{listed}:{number}: no image {stem!r} in {root / 'JPEGImages'}")
-            source.splits[split].append(_read_image(root, stem, pictures[stem], table, source))
+            if split == "val" or stem not in tests:
+                source.splits[split].append(_read_image(root, stem, pictures[stem], table, source))
+        if not split:
+            source.drawn_from = listed.name
     return source
 
 
+def _leave_out_test(lists: dict[str, Path], source: Source) -> set[str]:
+    """Take the list of the test split away, count its images, and return their names."""
+    listed = lists.pop(TEST, None)
+    if listed is None:
+        return set()
+    val = {stem for _, stem in read_lines(lists["val"])} if "val" in lists else set()
+    rows = read_lines(listed)
+    for number, stem in rows:
+        if stem not in val:
+            source.leave_out(TEST_LEFT_OUT, f"{listed}:{number}: {stem}")
+    return {stem for _, stem in rows}
+
+
 def _lists(root: Path) -> dict[str, Path]:
-    """Split -> the file that lists its images."""
+    """Return split -> the file that lists its images; "" -> one that a split is drawn from."""
     folder = root / "ImageSets" / "Segmentation"
-    if (folder / "train.txt").is_file() and (folder / "val.txt").is_file():
-        return {name: folder / f"{name}.txt" for name in ("train", "val")}
-    for name in ("trainval.txt", "default.txt"):
-        if (folder / name).is_file():
-            return {"": folder / name}
-    raise DataError(f"{folder}: no train.txt and val.txt, and no trainval.txt or default.txt")
+    files = {path.stem.lower(): path for path in sorted(folder.glob("*.txt"))}
+    named = {split: path for stem, path in files.items() if (split := split_named(stem))}
+    test = {TEST: named.pop(TEST)} if TEST in named else {}
+    if len(named) == 2:
+        return {"train": named["train"], "val": named["val"]} | test
+    whole = files.get("trainval") or files.get("default")
+    if whole is None:
+        places = "no train.txt and val.txt, and no trainval.txt or default.txt"
+        raise DataError(f"{folder}: {places}")
+    return {"": whole} | test
 
 
 def _class_table(path: Path | None) -> ClassTable:

@@ -3,12 +3,20 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from cohdc_train.errors import DataError
+from cohdc_train.images import (
+    Size,
+    is_read_as_stored,
+    orientation_of,
+    read_rgb,
+    size_of,
+    turn_upright,
+    upright_size,
+)
 
 _TAIL = 4096  # bytes at a file's end in which its end mark is looked for
 _END_MARKS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
@@ -20,17 +28,29 @@ PROBLEMS = {"missing": "does not exist", "truncated": "ends early", "corrupt": "
 class ImageFile(NamedTuple):
     """What a file says of itself.
 
-    width, height: px as stored, before any turning by EXIF; 0 when it cannot be read.
-    turned: its EXIF orientation turns it by 90 degrees; oriented: EXIF asks for any turning or mirroring.
+    stored: width and height in px, before any turning by EXIF; 0 when it cannot be read.
+    orientation: EXIF's, 1..8; 1 is upright.
     plain: 8-bit grey, palette or RGB. problem: "", "missing", "corrupt" or "truncated".
     """
 
-    width: int = 0
-    height: int = 0
-    turned: bool = False
-    oriented: bool = False
+    stored: Size = (0, 0)
+    orientation: int = 1
     plain: bool = True
     problem: str = ""
+
+    @property
+    def upright(self) -> Size:
+        """Width and height in px of the image as viewers show it."""
+        return upright_size(self.stored, self.orientation)
+
+    def is_turned(self, annotated: Size | None) -> bool:
+        """Whether EXIF turns or mirrors the image when it is read for an annotation of a size."""
+        as_stored = is_read_as_stored(self.stored, self.orientation, annotated)
+        return self.orientation > 1 and not as_stored
+
+    def size_for(self, annotated: Size | None) -> Size:
+        """Return the size at which the image is read for an annotation of a size."""
+        return self.upright if self.is_turned(annotated) else self.stored
 
 
 def look(path: Path, decode: bool = False) -> ImageFile:
@@ -39,43 +59,45 @@ def look(path: Path, decode: bool = False) -> ImageFile:
         return ImageFile(problem="missing")
     try:
         with Image.open(path) as image:
-            width, height = image.size
-            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-            facts = ImageFile(width, height, orientation in (5, 6, 7, 8), orientation in range(2, 9))
-            facts = facts._replace(plain=image.mode in _PLAIN_MODES)
+            facts = ImageFile(image.size, orientation_of(image), image.mode in _PLAIN_MODES)
             if decode or not _has_end(path, image.format):
                 image.load()
     except UnidentifiedImageError:
-        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        return ImageFile(problem="corrupt") if pixels is None else ImageFile(pixels.shape[1], pixels.shape[0])
+        pixels = read_rgb(path)
+        return ImageFile(problem="corrupt") if pixels is None else ImageFile(size_of(pixels))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         problem = "truncated" if "truncated" in str(error) else "corrupt"
         return ImageFile(problem=problem)
     return facts
 
 
-def check(path: Path, image_id: int, size: tuple[int, int]) -> None:
-    """Raise DataError naming file and id unless it can be read and is of the annotated size (width, height), px."""
+def check(path: Path, image_id: int, size: Size) -> None:
+    """Raise DataError naming file and id unless it can be read at the annotated size."""
     file = look(path)
     if file.problem:
         raise DataError(f"{path}: image {image_id} {PROBLEMS[file.problem]}")
-    check_size(path, image_id, (file.width, file.height), size)
+    check_size(path, image_id, file.size_for(size), size)
 
 
-def check_size(path: Path, image_id: int, found: tuple[int, int], annotated: tuple[int, int]) -> None:
+def check_size(path: Path, image_id: int, found: Size, annotated: Size) -> None:
     """Raise DataError naming file and id when the two sizes (width, height), px, differ."""
     if found != annotated:
-        turned = ": annotated as shown turned by EXIF?" if found == annotated[::-1] else ""
+        swapped = found == annotated[::-1]
+        turned = ": swapped, or the file lost its EXIF orientation?" if swapped else ""
         sizes = f"{found[0]}x{found[1]}, its annotation {annotated[0]}x{annotated[1]}"
         raise DataError(f"{path}: image {image_id} is {sizes}{turned}")
 
 
 def fingerprint(path: Path) -> NDArray[np.float32]:
-    """[256] grey values of the picture at 16x16, mean 0 and norm 1 (all 0 for a plain one): their product compares."""
+    """Return [256] grey values of the upright image at 16x16, of mean 0 and norm 1.
+
+    The product of two compares the images. All values are 0 for an image of one grey.
+    """
     with Image.open(path) as image:
+        orientation = orientation_of(image)
         image.draft("L", (8 * _SIDE, 8 * _SIDE))
         small = image.convert("L").resize((_SIDE, _SIDE), Image.Resampling.BOX)
-    values = np.asarray(small, dtype=np.float32).ravel()
+    values = turn_upright(np.asarray(small), orientation).astype(np.float32).ravel()
     values -= values.mean()
     return values / max(float(np.linalg.norm(values)), 1e-6)
 

@@ -142,13 +142,16 @@ def _image(split: Inspection, row: Row, annotations: Sequence[Row]) -> Row | Non
         return None
     for kind, found in (
         ("image-colour", not file.plain),
-        ("image-huge", file.width * file.height > _HUGE),
-        ("image-exif", file.oriented and (file.width, file.height) == (row["width"], row["height"])),
+        ("image-huge", file.stored[0] * file.stored[1] > _HUGE),
     ):
         if found:
             split.findings.add(kind, name)
     split.prints[name] = _fingerprint(path)
-    return _sized(split, row, file, annotations)
+    sized = _sized(split, row, file, annotations)
+    if sized is not None and file.orientation > 1:
+        is_turned = file.is_turned((sized["width"], sized["height"]))
+        split.findings.add("image-turned" if is_turned else "image-exif", name)
+    return sized
 
 
 def _fingerprint(path: Path) -> NDArray[np.float32]:
@@ -159,16 +162,17 @@ def _fingerprint(path: Path) -> NDArray[np.float32]:
 
 
 def _sized(split: Inspection, row: Row, file: ImageFile, annotations: Sequence[Row]) -> Row | None:
-    """The image row under the file's size; None when its annotations are of another picture."""
-    if (file.width, file.height) == (row["width"], row["height"]):
-        return row | {"width": file.width, "height": file.height}
-    name = str(row["file_name"])
-    if file.turned and (file.height, file.width) == (row["width"], row["height"]):
-        split.fault("image-turned", name, row)
-        return None
-    split.findings.add("image-size", name)
-    if all(fits(annotation, file.height, file.width) for annotation in annotations):
-        return row | {"width": file.width, "height": file.height}
+    """Return the image row under a size at which the file is read; None when no size fits.
+
+    A file is read upright, or as stored where that is the only size that fits.
+    """
+    sizes = (file.upright, file.stored)
+    if (row["width"], row["height"]) in sizes:
+        return row | {"width": int(row["width"]), "height": int(row["height"])}
+    split.findings.add("image-size", str(row["file_name"]))
+    for width, height in sizes:
+        if all(fits(annotation, height, width) for annotation in annotations):
+            return row | {"width": width, "height": height}
     split.remove("image-size", row)
     return None
 

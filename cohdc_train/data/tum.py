@@ -52,7 +52,8 @@ def tum(
         raise DataError(f"{out}: is not a folder")
     out.mkdir(parents=True, exist_ok=True)
     fetched = out / f"{folder.name}.tgz"
-    if archive is None and not fetched.is_file():
+    is_new = archive is None and not fetched.is_file()
+    if is_new:
         _download(f"{host}/{sequence.partition('_')[0]}/{fetched.name}", fetched)
     file = fetched if archive is None else archive
     try:
@@ -65,6 +66,8 @@ def tum(
     except DataError as error:
         if archive is not None:
             raise
+        if not is_new:  # it may have been fetched by hand
+            raise DataError(f"{error}; delete it to fetch it again") from error
         fetched.unlink(missing_ok=True)  # so that the next call fetches it again
         raise DataError(f"{error}; it was deleted") from error
     print(f"{folder}: {count} images, SHA-256 of the archive {found}")

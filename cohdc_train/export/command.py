@@ -44,6 +44,8 @@ def run(
     target = out if out is not None else checkpoint.parent / "model.onnx"
     if verify_only and not target.is_file():
         raise CohdcError(f"{target}: no such file")
+    if not verify_only:
+        _check_target(target, int8 is not None)
     module = MaskRCNNModule.load(checkpoint, Segmenter(target).canvas if verify_only else canvas)
     pictures = list(read_images(images, _PARITY_IMAGES)) if images is not None else drawn_images(_PARITY_IMAGES)
     scorer = Scorer(module, data, checkpoint) if data is not None else None
@@ -83,7 +85,7 @@ def _write_int8(
     target: Path, calibration: Path, report: dict[str, Any], scorer: Scorer | None, allow_drop: bool
 ) -> None:
     """The int8 form of a proven file, with its own report. Raises ExportError when it loses too much."""
-    name = target.with_name(f"{target.stem}.int8.onnx")
+    name = _int8_path(target)
     with _draft(name) as temporary:
         operators = quantize(target, temporary, read_images(calibration, CALIBRATION_IMAGES))
         facts = {key: report[key] for key in ("checkpoint", "checkpoint_sha256", "opset", "contract", "classes")}
@@ -157,6 +159,28 @@ def _checkpoint_of(file: Path) -> Path:
     if sha256(checkpoint) != digest:
         raise CohdcError(f"{path}: {checkpoint} has changed since the export")
     return checkpoint
+
+
+def _check_target(target: Path, int8: bool) -> None:
+    """Raise CohdcError when an export would replace files that no former export wrote.
+
+    An exported file is known by the report beside it, which names it.
+    """
+    for file in (target, _int8_path(target)) if int8 else (target,):
+        report = _report_path(file)
+        if not (file.exists() or report.exists()):
+            continue
+        try:
+            is_own = json.loads(report.read_text())["file"] == file.name
+        except (OSError, ValueError, KeyError, TypeError):
+            is_own = False
+        if not is_own:
+            fix = "give another --out, or move them"
+            raise CohdcError(f"{file}: it or {report.name} is not of a former cohdc export; {fix}")
+
+
+def _int8_path(target: Path) -> Path:
+    return target.with_name(f"{target.stem}.int8.onnx")
 
 
 def _report_path(file: Path) -> Path:

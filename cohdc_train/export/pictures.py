@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import CohdcError
+from cohdc_train.images import read_rgb
 
 Image = NDArray[np.uint8]
 
@@ -29,10 +30,10 @@ def read_images(folder: Path, count: int) -> Iterator[Image]:
 
 
 def _read(path: Path) -> Image:
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-    if picture is None:
+    pixels = read_rgb(path)
+    if pixels is None:
         raise CohdcError(f"{path}: not an image")
-    return np.asarray(picture, dtype=np.uint8)
+    return pixels
 
 
 def drawn_images(count: int) -> list[Image]:

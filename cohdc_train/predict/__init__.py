@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from cohdc_train.contour import Method, Polygon, simplify, trace
 from cohdc_train.errors import DataError
-from cohdc_train.files import write_bytes
-from cohdc_train.predict.annotation_files import Format, Found, coco, open_format
+from cohdc_train.files import OwnFiles, claim_folder, write_bytes
+from cohdc_train.predict.annotation_files import FILES, Format, Found, coco, open_format
 from cohdc_train.predict.drawing import draw, jpeg
 from cohdc_train.predict.pictures import Image, Picture, read_pictures
 from cohdc_train.segmenter import Detections, Segmenter
+
+_VERB = "predict"
 
 
 class Network(Protocol):
@@ -101,26 +103,31 @@ def predict_pictures(
     """Overlays and annotation files of pictures, in `out`. least: (score, quality or None) that are kept.
 
     An object whose mask covers no pixel's centre has no outline and is left out. Returns the COCO dictionary.
+    Raises DataError when `out` holds files of these names that no former prediction wrote.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    files = open_format(format, out, network.class_names, check_below)
-    overlays = out if format == "coco" else out / "overlays"  # apart from a folder that tools take for a data set
-    overlays.mkdir(exist_ok=True)
+    # Apart from files that tools take for a data set.
+    overlays = "" if format == "coco" else "overlays/"
+    present = [path.name for path in out.glob("*_overlay.jpg")] if format == "coco" else []
+    claim_folder(out, _VERB, [*FILES[format], *sorted(present)])
+    (out / overlays).mkdir(exist_ok=True)
     seen: list[Found] = []
-    try:
-        for picture in pictures:
-            found = _kept(network(picture.rgb), *least)
-            outlines = [_outline(mask, iou_floor, contour) for mask in found.masks()]
-            found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
-            outlines = [outline for outline in outlines if outline]
-            write_bytes(overlays / f"{picture.stem}_overlay.jpg", jpeg(draw(picture.rgb, found, outlines)))
-            files.picture(picture, one := Found.of(picture, found, outlines))
-            seen.append(one)
-    except DataError:
-        if seen:
-            files.close(seen, coco(seen, network.class_names))
-        raise
-    files.close(seen, content := coco(seen, network.class_names))
+    with OwnFiles(out, _VERB) as own:
+        files = open_format(format, out, own, network.class_names, check_below)
+        try:
+            for picture in pictures:
+                found = _kept(network(picture.rgb), *least)
+                outlines = [_outline(mask, iou_floor, contour) for mask in found.masks()]
+                found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
+                outlines = [outline for outline in outlines if outline]
+                overlay = own.path(f"{overlays}{picture.stem}_overlay.jpg")
+                write_bytes(overlay, jpeg(draw(picture.rgb, found, outlines)))
+                files.picture(picture, one := Found.of(picture, found, outlines))
+                seen.append(one)
+        except DataError:
+            if seen:
+                files.close(seen, coco(seen, network.class_names))
+            raise
+        files.close(seen, content := coco(seen, network.class_names))
     return content
 
 

@@ -11,12 +11,18 @@ import yaml
 from cohdc_train.contour import Polygon, joined
 from cohdc_train.contour.polygons import FloatArray
 from cohdc_train.errors import DataError
-from cohdc_train.files import write_bytes, write_text
+from cohdc_train.files import OwnFiles, write_bytes, write_text
 from cohdc_train.predict.drawing import jpeg
 from cohdc_train.predict.pictures import Picture
 from cohdc_train.segmenter import Detections
 
 Format = Literal["coco", "labelme", "yolo"]
+# What a format writes into the output folder, apart from files named after pictures.
+FILES: dict[Format, tuple[str, ...]] = {
+    "coco": ("predictions.json",),
+    "labelme": ("review.txt", "overlays"),
+    "yolo": ("data.yaml", "labels", "overlays"),
+}
 _LABELME = "5.5.0"  # whose files these are like
 
 
@@ -47,11 +53,20 @@ class Files(Protocol):
         """What belongs to all of them; content: their COCO dictionary."""
 
 
-def open_format(format: Format, out: Path, class_names: tuple[str, ...], check_below: float) -> Files:
-    """The writer of a format into a folder. check_below: quality below which labelme shapes are marked."""
+def open_format(
+    format: Format,
+    out: Path,
+    own: OwnFiles,
+    class_names: tuple[str, ...],
+    check_below: float,
+) -> Files:
+    """Return the writer of a format into a folder.
+
+    own: the files of this run in `out`; check_below: quality below which labelme shapes are marked.
+    """
     if format == "labelme":
-        return _Labelme(out, class_names, check_below)
-    return _Yolo(out, class_names) if format == "yolo" else _Coco(out)
+        return _Labelme(out, own, class_names, check_below)
+    return _Yolo(out, own, class_names) if format == "yolo" else _Coco(out)
 
 
 def coco(seen: Sequence[Found], class_names: Sequence[str]) -> dict[str, Any]:
@@ -118,8 +133,14 @@ class _Labelme:
     frames are written beside their file.
     """
 
-    def __init__(self, out: Path, class_names: tuple[str, ...], check_below: float) -> None:
-        self._out, self._names, self._check = out, class_names, check_below
+    def __init__(
+        self,
+        out: Path,
+        own: OwnFiles,
+        class_names: tuple[str, ...],
+        check_below: float,
+    ) -> None:
+        self._out, self._own, self._names, self._check = out, own, class_names, check_below
 
     def picture(self, picture: Picture, one: Found) -> None:
         file = self._out / f"{picture.stem}.json"
@@ -129,11 +150,11 @@ class _Labelme:
         if picture.path is not None:
             path = Path(os.path.relpath(picture.path.resolve(), self._out.resolve())).as_posix()
         else:
-            write_bytes(self._out / path, jpeg(picture.rgb))
+            write_bytes(self._own.path(path), jpeg(picture.rgb))
         height, width = one.size
         content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
         content |= {"imagePath": path, "imageData": None, "imageHeight": height, "imageWidth": width}
-        write_text(file, json.dumps(content, indent=1))
+        write_text(self._own.path(file.name), json.dumps(content, indent=1))
 
     def _shapes(self, one: Found) -> list[dict[str, Any]]:
         shapes = []
@@ -169,14 +190,14 @@ class _Yolo:
     video are written to images/ here. Labels belong to pictures by their stem, so that no two may have the same.
     """
 
-    def __init__(self, out: Path, class_names: tuple[str, ...]) -> None:
-        self._out, self._names = out, class_names
+    def __init__(self, out: Path, own: OwnFiles, class_names: tuple[str, ...]) -> None:
+        self._out, self._own, self._names = out, own, class_names
         (out / "labels").mkdir(exist_ok=True)
 
     def picture(self, picture: Picture, one: Found) -> None:
         if picture.path is None:
             (self._out / "images").mkdir(exist_ok=True)
-            write_bytes(self._out / "images" / picture.name, jpeg(picture.rgb))
+            write_bytes(self._own.path(f"images/{picture.name}"), jpeg(picture.rgb))
         elif picture.stem != picture.path.stem:
             raise DataError(f"{picture.path}: another image has this stem, and YOLO labels are found by it")
         height, width = one.size
@@ -184,7 +205,8 @@ class _Yolo:
         for label, outline in zip(one.found.labels.tolist(), one.outlines, strict=True):
             shares = (joined(outline) / (width, height)).ravel()
             lines.append(" ".join([str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]))
-        write_text(self._out / "labels" / f"{picture.stem}.txt", "".join(f"{line}\n" for line in lines))
+        labels = self._own.path(f"labels/{picture.stem}.txt")
+        write_text(labels, "".join(f"{line}\n" for line in lines))
 
     def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
         write_text(self._out / "data.yaml", yaml.safe_dump({"names": dict(enumerate(self._names))}, sort_keys=False))

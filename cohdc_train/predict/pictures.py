@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
+from cohdc_train.images import read_rgb
 
 Image = NDArray[np.uint8]
 
@@ -61,12 +62,11 @@ def _stored(source: Path) -> Iterator[Picture]:
 def _images(files: list[Path]) -> Iterator[Picture]:
     stems = Counter([file.stem for file in files] + [file.name for file in files])
     for file in files:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-        if bgr is None:
+        rgb = read_rgb(file)
+        if rgb is None:
             raise DataError(f"{file}: cannot be decoded as an image")
         name = file.stem if stems[file.stem] == 1 else file.name  # a.jpg and a.png must not share a file
-        yield Picture(file.name, name, _rgb(bgr), file)
+        yield Picture(file.name, name, rgb, file)
 
 
 def _frames(file: Path, origin: str | int) -> Iterator[Picture]:

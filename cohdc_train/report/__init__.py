@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from cohdc_train.errors import DataError
-from cohdc_train.files import write_text
+from cohdc_train.files import check_folder, list_files, write_text
 from cohdc_train.report.plots import Run, plot_errors, plot_over_time, plot_paths
 from cohdc_train.trajectory import Trajectory, align_umeyama, match, read_tum
 
@@ -73,7 +73,11 @@ def report(run: Path, *, against: Path | None = None, groundtruth: Path | None =
     page = out if out is not None else run / "report.html"
     if page.is_dir():
         raise DataError(f"{page}: is a folder; --out names the page")
+    if out is None:
+        check_folder(run, "report", [page.name])
     write_report(page, name, groundtruth, runs)
+    if out is None:
+        list_files(run, "report", [page.name])
     print(page)
     return page
 

@@ -16,7 +16,7 @@ from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.growing_sequence import Followed
 from cohdc_train.slam.io.live import stopped_by_ctrl_c
-from cohdc_train.slam.io.results import check_out, measure, publish, write_run
+from cohdc_train.slam.io.results import check_out, measure, publish_run, write_run
 from cohdc_train.slam.io.sources import Recorded, Source, rgbd_layout
 from cohdc_train.slam.io.stereo import stereo_layout
 from cohdc_train.slam.runner import Watcher, play
@@ -57,7 +57,8 @@ def slam(
     Args:
         sequence: folder with rgb.txt, depth.txt and their images, or left.txt and right.txt of a rectified stereo pair
             whose camera yaml has a baseline; groundtruth.txt is used for scores when there.
-        out: folder for the results; files of a former run are replaced.
+        out: folder for the results. Files of a former run are replaced and all others stay. A
+            folder that holds other files with the names of results is refused.
         model: ONNX written by `cohdc export`, or a shipped network's name (person, person_s); every frame is segmented.
         masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
         camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
@@ -73,7 +74,7 @@ def slam(
         view: show the run in rerun's window while it goes; needs `pip install 'cohdc-train[view]'`.
         rrd: file to record the same for rerun, to be looked at later.
     """
-    _check_options(out, model, masks, seed, features)
+    _check_options(out, cloud, model, masks, seed, features)
     source, origin = _source(sequence, camera, follow, idle)
     return run_source(
         source,
@@ -117,7 +118,7 @@ def run_source(
     been done as well, in real time up to a frame's time later; origin: words about the source for config.yaml. Raises
     DataError when no frame comes.
     """
-    _check_options(out, model, masks, seed, features)
+    _check_options(out, cloud, model, masks, seed, features)
     culling, method = culling or Culling(), method or Method()
     truth = None if source.groundtruth is None else read_tum(source.groundtruth)
     maker = _masks(model, masks, source.camera, culling, 1 if realtime else 0)
@@ -146,7 +147,7 @@ def run_source(
         metrics |= measure(records, trajectory, truth, beside.source.dropped if beside else 0)
         metrics |= beside.metrics() if beside else {}
         write_run(part, records, trajectory, metrics, config)
-        publish(part, out)
+        publish_run(part, out)
     print(f"{summary(metrics)}\nwritten to {out}")
     return metrics
 
@@ -171,14 +172,21 @@ def summary(metrics: dict[str, Any]) -> str:
     return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
-def _check_options(out: Path, model: Path | None, masks: Path | None, seed: int, features: int) -> None:
+def _check_options(
+    out: Path,
+    cloud: bool,
+    model: Path | None,
+    masks: Path | None,
+    seed: int,
+    features: int,
+) -> None:
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
     if seed < 0:
         raise DataError(f"seed is {seed}; it cannot be below 0")
     if features < MIN_START:
         raise DataError(f"features is {features}; a map cannot start with fewer than {MIN_START}")
-    check_out(out)
+    check_out(out, cloud)
 
 
 def _source(sequence: Path, camera: Path | None, follow: bool, idle: float) -> tuple[Source, dict[str, str]]:

@@ -20,8 +20,14 @@ from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.budget import FitTrainer, default_epochs, is_bounded, training_limits, validation_interval
 from cohdc_train.train.ema import ema
-from cohdc_train.train.initial_weights import InitialWeights, choose_initial_weights, resolve_network
+from cohdc_train.train.initial_weights import (
+    InitialWeights,
+    choose_initial_weights,
+    resolve_backbone_lr,
+    resolve_network,
+)
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.train.out_folder import check_out, claim_out
 from cohdc_train.train.pictures import ValidationPictures
 from cohdc_train.train.progress import ProgressReporter
 from cohdc_train.train.sanity import find_learning_rate, overfit_verdict
@@ -124,11 +130,13 @@ class FitCommand(LightningCLI):
         checkpoint: Path | None = self.config["ckpt_path"]
         if checkpoint is not None and not checkpoint.is_file():
             raise CohdcError(f"{checkpoint}: no such file")
+        check_out(self.config)
         network = self.config["model"]["network"]
         self.initial = choose_initial_weights(self.config["pretrained"], network, checkpoint)
-        if self.initial.kind != "resumed":
-            for name, value in resolve_network(self.initial, network).items():
-                network[name] = value
+        for name, value in resolve_network(self.initial, network).items():
+            network[name] = value
+        optimizer = self.config["model"]["optimizer"]
+        optimizer["backbone_lr"] = resolve_backbone_lr(self.initial, optimizer["backbone_lr"])
 
     def instantiate_classes(self) -> None:
         """Build data, network and trainer; a value that one of them refuses is the user's error."""
@@ -178,6 +186,7 @@ class FitCommand(LightningCLI):
 
     def run(self) -> None:
         """Train, from the initial weights or where `--ckpt_path` ended, and say how it went."""
+        claim_out(self.config)
         rank_zero_info(self.initial.describe(_num_images(self.datamodule)))
         if self.initial.kind == "network":
             left = self.model.take_over(model_path(self.initial.source))

@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ import yaml
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import NetworkConfig
 from cohdc_train.presets import config_path, model_path, shipped_models
+from cohdc_train.train.optimizer import OptimizerConfig
 
 FEW_IMAGES = 10_000  # below which random initial weights learn little
 SHIPPED = "person"  # the shipped network that networks of its layers start from
@@ -33,12 +34,14 @@ class InitialWeights:
         source: file, or torchvision's name of published backbone weights; empty without weights.
         norm: norm of the backbone that these weights ask for: "frozen" or "batch".
         reason: one clause on why there are no better ones, for "random"; empty otherwise.
+        stored: hyper-parameters of the checkpoint, for "resumed".
     """
 
     kind: Literal["network", "backbone", "random", "resumed"]
     source: str = ""
     norm: Literal["frozen", "batch"] = "frozen"
     reason: str = ""
+    stored: Mapping[str, Any] = field(default_factory=dict)
 
     def describe(self, num_images: int) -> str:
         """Return one line for the user. num_images: training images."""
@@ -62,7 +65,7 @@ def choose_initial_weights(pretrained: str, network: Network, resumed: Path | No
         CohdcError: there is no such file, or it cannot be read; one line names the flag.
     """
     if resumed is not None:
-        return InitialWeights("resumed", str(resumed))
+        return InitialWeights("resumed", str(resumed), stored=_read_weights(resumed).get("hyper_parameters", {}))
     if pretrained == "none":
         return InitialWeights("random", norm="batch", reason="--pretrained none")
     if pretrained == "imagenet":
@@ -86,20 +89,33 @@ def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]
 
     Raises CohdcError where a given norm cannot hold them.
     """
+    if initial.kind == "resumed":
+        stored = initial.stored.get("network", {})
+        undecided = {"norm": "auto", "frozen_stages": None}
+        decided = {name: stored.get(name, network[name]) for name, value in undecided.items() if network[name] == value}
+        return {"weights": None, **decided}
     is_exported = initial.kind == "network" and model_path(initial.source).suffix == ".onnx"
     if is_exported and network["norm"] == "batch":
         raise CohdcError(
             f"{initial.source}: an exported file holds no norms to train; give --model.network.norm frozen, or start "
             "from other weights with --pretrained"
         )
-    resolved = {
+    frozen_stages = network["frozen_stages"]
+    if frozen_stages is None:
+        frozen_stages = 0 if initial.kind == "random" else 2
+    return {
         "weights": initial.source if initial.kind == "backbone" else None,
         "norm": initial.norm if network["norm"] == "auto" else network["norm"],
-        "frozen_stages": network["frozen_stages"],
+        "frozen_stages": frozen_stages,
     }
-    if network["frozen_stages"] is None:
-        resolved["frozen_stages"] = 0 if initial.kind == "random" else 2
-    return resolved
+
+
+def resolve_backbone_lr(initial: InitialWeights, backbone_lr: float | None) -> float:
+    """Return the learning rate of the backbone, as a share of the rest's, that the initial weights ask for."""
+    if backbone_lr is None and initial.kind == "resumed":
+        backbone_lr = initial.stored.get("optimizer", {}).get("backbone_lr")
+    config = OptimizerConfig(backbone_lr=backbone_lr).resolved(pretrained=initial.kind != "random")
+    return config.backbone_lr or 0.0
 
 
 def _published(network: Network) -> InitialWeights:
@@ -120,15 +136,23 @@ def _of_file(pretrained: str) -> InitialWeights:
         )
     if path.suffix == ".onnx":
         return InitialWeights("network", pretrained)
+    stored = _read_weights(path)
+    if "hyper_parameters" in stored:
+        norm = stored["hyper_parameters"].get("network", {}).get("norm", "batch")
+        return InitialWeights("network", pretrained, norm)
+    return InitialWeights("backbone", pretrained)
+
+
+def _read_weights(path: Path) -> dict[str, Any]:
+    """Read what `torch.save` wrote. Raises CohdcError naming the file when it is neither weights nor a checkpoint."""
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
         reason = str(error).partition("\n")[0]
         raise CohdcError(f"{path}: neither a checkpoint nor a state dict: {reason}") from error
-    if isinstance(stored, dict) and "hyper_parameters" in stored:
-        norm = stored["hyper_parameters"].get("network", {}).get("norm", "batch")
-        return InitialWeights("network", pretrained, norm)
-    return InitialWeights("backbone", pretrained)
+    if not isinstance(stored, dict):
+        raise CohdcError(f"{path}: neither a checkpoint nor a state dict: it holds a {type(stored).__name__}")
+    return stored
 
 
 def _has_layers_of_shipped(network: Network) -> bool:

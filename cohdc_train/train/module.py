@@ -43,7 +43,8 @@ class MaskRCNNModule(pl.LightningModule):
         self.class_names = list(class_names)
         config: NetworkConfig = _rebuild(NetworkConfig, network)
         self.network_config = config.resolved(pretrained=config.weights is not None)
-        self.optimizer_config = _rebuild(OptimizerConfig, optimizer)
+        schedule: OptimizerConfig = _rebuild(OptimizerConfig, optimizer)
+        self.optimizer_config = schedule.resolved(pretrained=config.weights is not None)
         self.rescore = rescore
         self.min_quality = 0.0  # of the detections that validation scores
         # Plain values only, so that a checkpoint loads under torch.load(weights_only=True).

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -14,6 +14,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cohdc_train.models import MaskRCNN
 
+PRETRAINED_BACKBONE_LR = 0.3
 Progress = Callable[[int], float]  # step -> share of the training budget that is used, 0..1
 
 
@@ -32,7 +33,8 @@ class OptimizerConfig:
         warmup_ratio: share of the budget over which the rate rises from 0.
         warmup_steps: length of the warm-up in steps instead; None takes warmup_ratio.
         final_fraction: share of lr left at the end; 1 keeps it constant after the warm-up.
-        backbone_lr: learning rate of the backbone as a share of lr.
+        backbone_lr: learning rate of the backbone as a share of lr; None is 0.3 with trained initial weights, and 1
+            without.
         frozen_steps: steps at the beginning in which the backbone is not trained.
     """
 
@@ -43,7 +45,7 @@ class OptimizerConfig:
     warmup_ratio: float = 0.05
     warmup_steps: int | None = None
     final_fraction: float = 0.01
-    backbone_lr: float = 1.0
+    backbone_lr: float | None = None
     frozen_steps: int = 0
 
     def __post_init__(self) -> None:
@@ -53,8 +55,14 @@ class OptimizerConfig:
             raise ValueError(
                 f"warmup_ratio {self.warmup_ratio} must be in 0..1 and warmup_steps {self.warmup_steps} not negative"
             )
-        if self.backbone_lr < 0 or self.frozen_steps < 0:
+        if (self.backbone_lr or 0) < 0 or self.frozen_steps < 0:
             raise ValueError(f"backbone_lr {self.backbone_lr} or frozen_steps {self.frozen_steps} is negative")
+
+    def resolved(self, pretrained: bool) -> "OptimizerConfig":
+        """Return a copy in which backbone_lr is decided. pretrained: the backbone's initial weights are trained."""
+        if self.backbone_lr is not None:
+            return self
+        return replace(self, backbone_lr=PRETRAINED_BACKBONE_LR if pretrained else 1.0)
 
     def factor(self, step: int, progress: float) -> float:
         """Return the share of lr at a step.
@@ -84,11 +92,17 @@ def build_optimizer(
     Weights and the rest (biases, norms) of the backbone and of what surrounds it are four groups. The learning rate of
     a backbone that is not trained yet is 0: its gradients exist, so that every rank of a distributed run has them.
     """
+    backbone_share = 1.0 if config.backbone_lr is None else config.backbone_lr
     groups: list[dict[str, object]] = []
     factors: list[Callable[[int], float]] = []
     for name, share, frozen_steps, parameters in (
         ("heads", 1.0, 0, [p for name, p in network.named_parameters() if not name.startswith("backbone.body.")]),
-        ("backbone", config.backbone_lr, config.frozen_steps, list(network.backbone.body.parameters())),
+        (
+            "backbone",
+            backbone_share,
+            config.frozen_steps,
+            list(network.backbone.body.parameters()),
+        ),
     ):
         for weights in (True, False):
             chosen: list[Tensor] = [p for p in parameters if p.requires_grad and (p.ndim > 1) == weights]

@@ -18,6 +18,7 @@ from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.plots import class_names, plot_calibration, plot_confusion, plot_log, plot_precision_recall
 from cohdc_train.train.tiles import draw_tiles
 
+VALIDATION_FILES = ("best.jpg", "worst.jpg", "pr_curves.png", "calibration.png", "confusion.png")
 _IMAGES = 6  # in a grid
 _SCORE = "score = sum of mask IoU of the objects found / (objects + false detections)"
 

@@ -134,7 +134,7 @@ def check_mended(folder: Path, root: Path) -> None:
     code, found = findings(linked)
     assert code == 0
     still = {kind for split in found.values() for kind in split if KINDS[kind].severity == "warning"}
-    assert still <= {"image-exif", "image-colour", "category-unused", "class-only-val"}
+    assert still <= {"image-colour", "category-unused", "class-only-val"}
 
 
 def test_the_mend_never_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -143,6 +143,21 @@ def test_the_mend_never_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.
     assert main(["data", "doctor", str(root), "--fix", str(root)]) == 1
     assert "would overwrite" in capsys.readouterr().err
     assert (root / "instances_train.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("option", ["--fix", "--out"])
+@pytest.mark.parametrize("name", ["instances_val.json", "findings.json"])
+def test_doctor_keeps_files_it_did_not_write(
+    tmp_path: Path, option: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, out = toys.folder(tmp_path / "a"), tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("mine")
+    is_refused = (option == "--fix") == (name == "instances_val.json")
+    assert main(["data", "doctor", str(root), option, str(out)]) == is_refused
+    assert (f"holds {name}, not written" in capsys.readouterr().err) == is_refused
+    assert main(["data", "doctor", str(root), option, str(out)]) == is_refused, "the second time"
+    assert (out / name).read_text() == "mine"
 
 
 def test_a_class_that_only_validation_has_objects_of(tmp_path: Path) -> None:

@@ -101,6 +101,14 @@ def test_what_the_host_gives_instead_of_an_archive_is_not_kept(tmp_path: Path, h
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_archive_that_was_not_fetched_now_is_kept(tmp_path: Path, host: str) -> None:
+    (tmp_path / f"{NAME}.tgz").write_bytes(b"fetched by hand, cut off")
+    with pytest.raises(DataError, match=r"not a whole \.tgz: .*; delete it to fetch it again"):
+        tum("walking_xyz", out=tmp_path, host=host)
+    assert (tmp_path / f"{NAME}.tgz").read_bytes() == b"fetched by hand, cut off"
+    assert Host.asked == []
+
+
 @pytest.mark.parametrize("ranges", [True, False])
 def test_a_download_goes_on_where_it_was_cut_off(tmp_path: Path, host: str, ranges: bool) -> None:
     Host.breaks = 100

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
+from cohdc_train.files import MANIFEST, files_below
 from cohdc_train.segmenter import Detections
 from cohdc_train.slam.config import Culling, Method
 from cohdc_train.slam.dynamics.mask_sources import ModelMasks
@@ -59,7 +60,8 @@ def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
 
 def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequence: Path) -> None:
     names = {path.name for path in masked.iterdir()}
-    assert names == {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", "map.ply", "map.png", "pictures"}
+    tables = {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", MANIFEST}
+    assert names == tables | {"map.ply", "map.png", "pictures"}
     assert [path.name for path in masked.parent.iterdir()] == ["run"], "no temporary folder is left"
     trajectory, truth = read_tum(masked / "trajectory.txt"), read_tum(sequence / "groundtruth.txt")
     np.testing.assert_array_equal(trajectory.stamps, truth.stamps)
@@ -84,22 +86,56 @@ def test_pictures_show_what_was_culled(masked: Path) -> None:
     assert (before != after).any()
 
 
-def test_without_masks_or_geometry_the_passer_by_spoils_it_and_a_rerun_replaces_the_files(
-    sequence: Path, masked: Path, tmp_path: Path
+def test_without_masks_or_geometry_the_passer_by_spoils_it(
+    sequence: Path,
+    masked: Path,
+    tmp_path: Path,
 ) -> None:
     good = json.loads((masked / "metrics.json").read_text())["ate_m"]["rmse"]
-    (tmp_path / "pictures").mkdir()
-    (tmp_path / "pictures" / "old.jpg").touch()
-    (tmp_path / "mine.txt").touch()
-    (tmp_path / "cloud.ply").touch()
     metrics = slam(sequence=sequence, out=tmp_path, features=500, method=Method(geometry=False, static_weights=False))
     assert metrics["ate_m"]["rmse"] > 5 * good
     assert metrics["ms"]["segment"]["p95"] == 0
-    assert (tmp_path / "mine.txt").exists()
-    assert not (tmp_path / "cloud.ply").exists(), "a former run's cloud is not this one's"
-    pictures = [path.name for path in (tmp_path / "pictures").iterdir()]
-    assert len(pictures) == 6
-    assert "old.jpg" not in pictures
+    assert len(list((tmp_path / "pictures").iterdir())) == 6
+
+
+def test_run_keeps_files_it_did_not_write(
+    sequence: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ("pictures/holiday.jpg", "cloud.ply", "config.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(f"mine: {name}")
+    arguments = ["slam", "--sequence", str(sequence), "--out", str(tmp_path), "--cloud"]
+    assert main(arguments) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    names = "config.yaml, pictures, cloud.ply"
+    assert f"{tmp_path}: holds {names}, not written by a former cohdc slam" in line
+    assert "give another --out" in line
+    assert files_below(tmp_path) == ["cloud.ply", "config.yaml", "pictures/holiday.jpg"]
+    for name in files_below(tmp_path):
+        assert (tmp_path / name).read_text() == f"mine: {name}"
+
+
+def test_second_run_replaces_its_files_removes_stale_ones_and_keeps_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, long, short = tmp_path / "out", tmp_path / "long", tmp_path / "short"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    slam(sequence=write_sequence(long, 8), out=out, features=200, cloud=True)
+    pictures = set(files_below(out / "pictures"))
+    assert (out / "cloud.ply").is_file()
+    (out / "pictures" / "holiday.jpg").write_text("mine")
+    slam(sequence=write_sequence(short, 2), out=out, features=200)
+    assert json.loads((out / "metrics.json").read_text())["frames"] == 2
+    assert not (out / "cloud.ply").exists()
+    assert set(files_below(out / "pictures")) < pictures | {"holiday.jpg"}
+    assert {(out / name).read_text() for name in ("mine.txt", "pictures/holiday.jpg")} == {"mine"}
+    (out / "cloud.ply").write_text("mine")
+    assert main(["slam", "--sequence", str(short), "--out", str(out), "--cloud"]) == 1
+    assert "holds cloud.ply, not written" in capsys.readouterr().err
+    assert (out / "cloud.ply").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,12 @@ import yaml
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import NetworkConfig
 from cohdc_train.presets import config_path
-from cohdc_train.train.initial_weights import InitialWeights, choose_initial_weights, resolve_network
+from cohdc_train.train.initial_weights import (
+    InitialWeights,
+    choose_initial_weights,
+    resolve_backbone_lr,
+    resolve_network,
+)
 
 
 def fields(config: str | None = None, **changes: Any) -> dict[str, Any]:
@@ -82,8 +87,22 @@ def test_files_are_told_apart_by_their_content(tmp_path: Path) -> None:
         choose_initial_weights("persn", network)
 
 
-def test_resuming_needs_no_other_weights(tmp_path: Path) -> None:
-    assert choose_initial_weights("auto", fields("resnet50"), tmp_path / "last.ckpt").kind == "resumed"
+def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
+    last = tmp_path / "last.ckpt"
+    hyper = {"network": {"norm": "frozen", "frozen_stages": 3}, "optimizer": {"backbone_lr": 0.2}}
+    torch.save({"hyper_parameters": hyper, "state_dict": {}}, last)
+    network = fields("resnet50")
+    initial = choose_initial_weights("auto", network, last)
+    assert initial.kind == "resumed"
+    assert resolve_network(initial, network) == {"weights": None, "norm": "frozen", "frozen_stages": 3}
+    assert "norm" not in resolve_network(initial, fields("resnet50", norm="batch"))
+    assert resolve_backbone_lr(initial, None) == 0.2
+    assert resolve_backbone_lr(initial, 0.7) == 0.7
+
+
+def test_backbone_learns_slower_from_trained_weights() -> None:
+    assert resolve_backbone_lr(InitialWeights("network", "person"), None) == 0.3
+    assert resolve_backbone_lr(InitialWeights("random", norm="batch"), None) == 1.0
 
 
 def test_norms_that_an_exported_file_cannot_hold_are_refused() -> None:

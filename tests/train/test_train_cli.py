@@ -320,6 +320,28 @@ def test_a_decay_of_one_is_refused(toy: Path, tmp_path: Path) -> None:
         fit(arguments(toy, tmp_path, "--ema=1.0"))
 
 
+@pytest.mark.parametrize("name", ["best.ckpt", "last.ckpt", "config.yaml"])
+def test_fit_keeps_files_it_did_not_write(
+    toy: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    assert main(["fit", *arguments(toy, tmp_path)]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    (line,) = [line for line in lines if line.startswith("cohdc fit: ")]
+    assert f"{tmp_path}: holds {name}, not written by a former cohdc fit" in line
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_validate_keeps_pictures_it_did_not_write(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "best.jpg").write_text("mine")
+    assert main(["validate", "person", str(toy), f"--pictures={tmp_path}"]) == 1
+    assert "holds best.jpg, not written by a former cohdc validate" in capsys.readouterr().err
+    assert (tmp_path / "best.jpg").read_text() == "mine"
+
+
 def test_the_batch_size_is_found(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fit(arguments(toy, tmp_path, "--data.batch_size=auto", "--data.mini_mask=[28,28]"))
     assert "batch size: 32" in capsys.readouterr().out

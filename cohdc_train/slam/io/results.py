@@ -2,8 +2,6 @@
 
 import csv
 import json
-import os
-import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -13,10 +11,15 @@ import numpy as np
 import yaml
 
 from cohdc_train.errors import DataError
+from cohdc_train.files import check_folder, publish
 from cohdc_train.slam.frame import FrameRecord
 from cohdc_train.trajectory import Trajectory, score, write_tum
 
-_NOT_ALWAYS = ("cloud.ply", "map.png")  # files of a run that not every run writes
+_VERB = "slam"
+_NAMES = (
+    *("trajectory.txt", "metrics.json", "frames.csv", "config.yaml"),
+    *("map.ply", "map.png", "pictures"),
+)
 
 
 def measure(
@@ -77,23 +80,21 @@ def write_run(
             writer.writerow([record.stamp, int(pose.tracked), int(pose.keyframe), pose.inliers, culled, *times])
 
 
-def publish(part: Path, out: Path) -> None:
-    """Move everything in `part` into `out` by renaming; what a former run left under the same names goes, and its maps
-    where this one made none."""
-    out.mkdir(parents=True, exist_ok=True)
-    for name in _NOT_ALWAYS:
-        (out / name).unlink(missing_ok=True)
-    for item in sorted(part.iterdir()):
-        target = out / item.name
-        if target.is_dir():
-            shutil.rmtree(target)
-        os.replace(item, target)
+def publish_run(part: Path, out: Path) -> None:
+    """Move the files of a run into `out`, in place of those of a former one.
+
+    A file that somebody else put there during the run stays, and is named on stderr.
+    """
+    for name in publish(part, out, _VERB):
+        print(f"{out / name}: is not of a run and was kept; this run's is lost", file=sys.stderr)
 
 
-def check_out(out: Path) -> None:
-    """Raise DataError when `out` cannot become a folder of results. Makes the folder above it."""
-    if out.exists() and not out.is_dir():
-        raise DataError(f"{out}: is a file; --out names a folder")
+def check_out(out: Path, cloud: bool) -> None:
+    """Raise DataError when `out` cannot become a folder of results. Makes the folder above it.
+
+    cloud: whether the run writes cloud.ply.
+    """
+    check_folder(out, _VERB, [*_NAMES, "cloud.ply"] if cloud else _NAMES)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for folder in (out.parent, out):

@@ -1,0 +1,34 @@
+"""The folder that `cohdc fit` writes into: files there that no former training wrote are kept."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.utilities import rank_zero_only
+
+from cohdc_train.files import check_folder, claim_folder
+
+_VERB = "fit"
+
+
+@rank_zero_only
+def check_out(config: Mapping[str, Any]) -> None:
+    """Raise DataError when a training would write over files that no former training wrote.
+
+    config: resolved options of `cohdc fit`. Only the first process looks: the others start when it
+    may have written already.
+    """
+    check_folder(Path(config["out"]), _VERB, _names(config))
+
+
+@rank_zero_only
+def claim_out(config: Mapping[str, Any]) -> None:
+    """Make the folder and list in its manifest what the training will write, after `check_out`."""
+    claim_folder(Path(config["out"]), _VERB, _names(config))
+
+
+def _names(config: Mapping[str, Any]) -> list[str]:
+    """Return the names that a training replaces; logs/ gets a new version_N each time."""
+    best = f"{config['checkpoint']['filename']}.ckpt"
+    names = ["config.yaml", best, "last.ckpt", "lr_find.png"]
+    return [*names, "pictures"] if config["pictures"] else names
