@@ -217,7 +217,7 @@ class RealSense(ModuleType):
 
 
 def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "live.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     monkeypatch.setitem(sys.modules, "pyrealsense2", RealSense())
     monkeypatch.chdir(tmp_path)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_slam_map_files import read_ply
+from ply_reader import read_ply
 
 from cohdc_train.slam.run import slam
 from cohdc_train.trajectory import match, read_tum

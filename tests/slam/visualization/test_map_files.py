@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room, write_sequence
+from ply_reader import read_ply
 
 from cohdc_train.cli import main
 from cohdc_train.slam.io.ply import write_ply
@@ -20,19 +21,6 @@ from cohdc_train.slam.visualization.top_view import from_above
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 Points = NDArray[np.float64]
-
-
-def read_ply(path: Path) -> tuple[Points, NDArray[np.uint8]]:
-    """The least a PLY reader does: the header's words, then fixed rows."""
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    words = head.decode("ascii").split("\n")
-    assert words[:2] == ["ply", "format binary_little_endian 1.0"]
-    count = next(int(line.split()[2]) for line in words if line.startswith("element vertex"))
-    kinds = {"float": "<f4", "uchar": "u1"}
-    rows = np.frombuffer(body, np.dtype([(w[2], kinds[w[1]]) for w in map(str.split, words) if w[:1] == ["property"]]))
-    assert len(rows) == count
-    points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    return points, np.stack([rows[name] for name in ("red", "green", "blue")], axis=1)
 
 
 def off_the_room(points: Points) -> Points:
