@@ -36,7 +36,7 @@ class Augmentation:
     """
 
     flip: float = 0.5
-    scale_jitter: tuple[float, float] = (0.5, 1.5)
+    scale_jitter: tuple[float, float] = (0.8, 1.25)
     copy_paste: float = 0.0
     photometric: bool = True
     degrade: float = 0.0

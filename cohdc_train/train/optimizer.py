@@ -14,7 +14,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cohdc_train.models import MaskRCNN
 
-PRETRAINED_BACKBONE_LR = 0.3
+PRETRAINED_BACKBONE_LR = 0.2
 Progress = Callable[[int], float]  # step -> share of the training budget that is used, 0..1
 
 
@@ -33,13 +33,13 @@ class OptimizerConfig:
         warmup_ratio: share of the budget over which the rate rises from 0.
         warmup_steps: length of the warm-up in steps instead; None takes warmup_ratio.
         final_fraction: share of lr left at the end; 1 keeps it constant after the warm-up.
-        backbone_lr: learning rate of the backbone as a share of lr; None is 0.3 with trained initial weights, and 1
+        backbone_lr: learning rate of the backbone as a share of lr; None is 0.2 with trained initial weights, and 1
             without.
         frozen_steps: steps at the beginning in which the backbone is not trained.
     """
 
     name: Literal["sgd", "adamw"] = "adamw"
-    lr: float = 8e-4
+    lr: float = 1.2e-3
     weight_decay: float = 0.05
     momentum: float = 0.9
     warmup_ratio: float = 0.05

@@ -101,7 +101,7 @@ def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
 
 
 def test_backbone_learns_slower_from_trained_weights() -> None:
-    assert resolve_backbone_lr(InitialWeights("network", "person"), None) == 0.3
+    assert resolve_backbone_lr(InitialWeights("network", "person"), None) == 0.2
     assert resolve_backbone_lr(InitialWeights("random", norm="batch"), None) == 1.0
 
 
