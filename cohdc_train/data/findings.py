@@ -101,7 +101,8 @@ class Findings:
 
     def add(self, kind: str, where: str) -> None:
         """One more finding. A kind that `KINDS` does not hold is a bug: KeyError."""
-        assert KINDS[kind]
+        if kind not in KINDS:
+            raise KeyError(kind)
         self.places.setdefault(kind, []).append(where)
 
     def of(self, severity: Severity) -> dict[str, list[str]]:

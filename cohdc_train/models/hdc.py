@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-DEFAULT_PATTERN = (1, 2, 3)  # the paper's rates
-
 
 def max_distance(rates: Sequence[int]) -> int:
     """M_2 of eq. 1: the largest distance between two non-zeros that reach the second layer; M_1 for a single layer.

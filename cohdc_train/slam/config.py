@@ -6,6 +6,7 @@ import numpy as np
 
 from cohdc_train.errors import DataError
 
+MAX_KEYPOINTS = 1500  # per frame
 ACCELERATION = np.repeat([1.0, 4.0], 3)  # m/s^2 and rad/s^2, one standard deviation
 LONGEST = 0.2  # s, longest gap between two frames over which the velocity is used
 SHORTEST = 1e-3  # s, shortest step between two frames from which a velocity is taken

@@ -9,7 +9,7 @@ from typing import Any
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
-from cohdc_train.slam.config import Culling, Method
+from cohdc_train.slam.config import MAX_KEYPOINTS, Culling, Method
 from cohdc_train.slam.dynamics.mask_sources import FolderMasks, ModelMasks, no_masks
 from cohdc_train.slam.frame import OnPose
 from cohdc_train.slam.geometry.calibration import choose_camera
@@ -27,8 +27,6 @@ from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import Viewer
 from cohdc_train.trajectory import Trajectory, read_tum
 
-_FEATURES = 1500  # corners per frame
-
 
 def slam(
     *,
@@ -38,7 +36,7 @@ def slam(
     masks: Path | None = None,
     camera: Path | None = None,
     seed: int = 0,
-    features: int = _FEATURES,
+    features: int = MAX_KEYPOINTS,
     culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
     method: Method = Method(),  # noqa: B008 - the same
     realtime: bool = False,
@@ -100,7 +98,7 @@ def run_source(
     model: Path | None = None,
     masks: Path | None = None,
     seed: int = 0,
-    features: int = _FEATURES,
+    features: int = MAX_KEYPOINTS,
     culling: Culling | None = None,
     method: Method | None = None,
     realtime: bool = False,

@@ -289,6 +289,8 @@ def told_in_one_line() -> Iterator[None]:
             yield
         except CohdcError as error:
             lines = str(error).strip().splitlines()
-            raise CohdcError(lines[-1].partition("Error: ")[2] if len(lines) > 1 else str(error)) from error
+            last = lines[-1] if lines else "no message"
+            # A worker process sends a traceback, whose last line is the error's name and message.
+            raise CohdcError((last.partition("Error: ")[2] or last) if len(lines) > 1 else last) from error
         except (MisconfigurationException, FileNotFoundError) as error:
             raise CohdcError(" ".join(str(error).split())) from error

@@ -17,7 +17,7 @@ import coco_toys
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import NetworkConfig
-from cohdc_train.train.cli import fit
+from cohdc_train.train.cli import fit, told_in_one_line
 from cohdc_train.train.module import MaskRCNNModule
 
 TINY = """
@@ -378,3 +378,17 @@ def test_two_pictures_are_learnt_by_heart(tmp_path: Path) -> None:
     assert trainer.callback_metrics["val/segm_AP50"] == 1.0
     assert trainer.callback_metrics["val/box_AP50"] == 1.0
     assert trainer.callback_metrics["val/mIoU"] > 0.8
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("one line", "one line"),
+        ("Traceback\n  here\nDataError: a.png: is broken", "a.png: is broken"),
+        ("two lines\nwithout a name", "without a name"),
+    ],
+)
+def test_error_is_told_by_its_last_line(text: str, told: str) -> None:
+    with pytest.raises(CohdcError) as error, told_in_one_line():
+        raise CohdcError(text)
+    assert str(error.value) == told

@@ -3,21 +3,24 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cohdc_train.errors import DataError
-from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.slam.config import Culling
 from cohdc_train.slam.dynamics.masks import Mask, grow
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.tum import read_mask
 
+if TYPE_CHECKING:  # it loads onnxruntime, which a run without a model does not need
+    from cohdc_train.segmenter import Detections, Segmenter
+
 MaskSource = Callable[[View], Mask | None]
 
 
-def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Culling) -> Mask:
+def dynamic_mask(detections: "Detections", labels: frozenset[int], culling: Culling) -> Mask:
     """The union of the dynamic objects' masks, each grown by what `growth` says of its quality.
 
     A contour that CQE doubts gets a wider band instead of being left out, for a missed person costs more than lost
@@ -31,7 +34,7 @@ def dynamic_mask(detections: Detections, labels: frozenset[int], culling: Cullin
     return union
 
 
-def dynamic_objects(detections: Detections, labels: frozenset[int], culling: Culling) -> Detections:
+def dynamic_objects(detections: "Detections", labels: frozenset[int], culling: Culling) -> "Detections":
     """Those of the dynamic classes that are sure enough."""
     sure = (detections.scores >= culling.score) & (detections.quality >= culling.quality)
     return detections.select(sure & np.isin(detections.labels, list(labels)))
@@ -68,7 +71,7 @@ class FolderMasks:
 class ModelMasks:
     """Every frame goes through the segmenter; raises DataError for a class that the model does not know."""
 
-    def __init__(self, segmenter: Segmenter, culling: Culling) -> None:
+    def __init__(self, segmenter: "Segmenter", culling: Culling) -> None:
         names = segmenter.class_names
         wanted = names if culling.dynamic_classes is None else culling.dynamic_classes
         unknown = [name for name in wanted if name not in names]

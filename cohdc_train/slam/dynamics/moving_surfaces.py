@@ -55,7 +55,7 @@ class Movers:
         seen = self._last_seen(t, hit, labels, before & known)
         starts = (hit >= _FOUND * size) & (short <= _STILL * size) & (size >= LEAST)
         goes_on = (again >= _AGAIN * size) & (long <= _STILL * size) & (size >= LEAST) & (t - seen <= _LASTS)
-        movers = np.asarray(known & (found | starts[labels] | goes_on[labels] & (before | ~stood)))
+        movers = np.asarray(known & (found | starts[labels] | (goes_on[labels] & (before | ~stood))))
         if np.count_nonzero(movers) > _MOST * np.count_nonzero(known):
             movers = np.zeros_like(found)
         covered = _covered(masked if self._masked is None else masked & self._masked, image)

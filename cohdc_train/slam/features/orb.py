@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import MAX_KEYPOINTS
 from cohdc_train.slam.features.depth_sampling import sample_depth
 from cohdc_train.slam.features.keypoints import _SCALES, LEVELS, SCALE, Corners, Features
 from cohdc_train.slam.geometry.camera import Camera
@@ -21,7 +22,7 @@ _THRESHOLDS = (40, 20, 12, 7)  # of FAST, grey levels: the weaker a corner may b
 class FeatureExtractor:
     """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a crowd costs none."""
 
-    def __init__(self, camera: Camera, budget: int = 1000) -> None:
+    def __init__(self, camera: Camera, budget: int = MAX_KEYPOINTS) -> None:
         self.camera = camera
         self.budget = budget
         self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]

@@ -174,7 +174,12 @@ class Map:
         return [keyframes[i] for i in order if shared[i] > 0]
 
     def observers_of(self, ids: NDArray[np.int64]) -> list[Keyframe]:
-        """The keyframes that see at least one of the points, of those that each point remembers."""
+        """Return the keyframes that see at least one of the points.
+
+        A point remembers a few of its observers; where it has more, all keyframes are returned.
+        """
+        if (self.seen_by[ids] > _OBSERVERS).any():
+            return list(self.keyframes)
         return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
 
     def move(self, poses: Array) -> None:
@@ -241,4 +246,5 @@ class Map:
         while len(self.positions) < count:
             for name in names:
                 array = getattr(self, name)
-                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+                blank = -1 if name == "became" else 0
+                setattr(self, name, np.concatenate([array, np.full_like(array, blank)]))

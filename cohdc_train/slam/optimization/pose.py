@@ -33,9 +33,8 @@ def optimize_pose(
     limits = seen.limits
     used = np.ones(len(points), dtype=np.bool_)
     for _ in range(rounds):
-        if used.sum() < 6:
-            break
-        T_cw = _refine(T_cw, points[used], seen.take(used), weighing, prior)
+        if used.sum() >= 6:
+            T_cw = _refine(T_cw, points[used], seen.take(used), weighing, prior)
         used = chi_square(T_cw, points, seen, weighing) <= limits
     return T_cw, used
 

@@ -129,9 +129,12 @@ class Localizer:
         if inlier.sum() < minimum:
             return None
         matches = matches.take(inlier)
+        reference = self.map.covisible(matches.points, 1)
+        if not reference:  # no keyframe is remembered that sees one of them
+            return None
         self.map.visible[projected.ids] += 1
         self.map.found[matches.points] += 1
-        return Fit(T_cw, matches, self.map.covisible(matches.points, 1)[0], prior)
+        return Fit(T_cw, matches, reference[0], prior)
 
     def settle(self, features: Features, fit: Fit) -> Fit | None:
         """The final pose of a frame that was found, by corners that may have been moved since. None where hardly

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.config import Method
+from cohdc_train.errors import DataError
+from cohdc_train.slam.config import MAX_KEYPOINTS, Method
 from cohdc_train.slam.dynamics.dynamic_mask import DynamicMask
 from cohdc_train.slam.dynamics.free_space import Geometry
 from cohdc_train.slam.features.descriptors import thumbnail
@@ -68,7 +69,7 @@ class Tracker:
     def __init__(
         self,
         camera: Camera,
-        features: int,
+        features: int = MAX_KEYPOINTS,
         seed: int = 0,
         method: Method | None = None,
         executor: Executor | None = None,
@@ -95,6 +96,7 @@ class Tracker:
         self._spent = spent
         self._motion = Motion()
         self._last: Fit | None = None
+        self._latest_t: float | None = None  # s, of the latest frame
         self._reference_inliers = 0.0
         self._since_keyframe = 0
         self._log = FrameLog()
@@ -117,6 +119,7 @@ class Tracker:
         depth_t: s, when depth was taken, where that differs from t. on_pose: called as soon as there is an answer,
         before the work that the frame makes for those to come; what is returned may be more exact.
         """
+        self._check_input(rgb, depth_m, t, mask)
         answer = Answer(t, on_pose)
         self._let(self._mapping.collect)
         frame = _Frame(rgb, depth_m, t, mask, None if depth_t is None else depth_t - t)
@@ -152,6 +155,21 @@ class Tracker:
         if wanted and not keyframe:
             self._let(self._mapping.work)
         return answer.pose(fit, keyframe)
+
+    def _check_input(
+        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], t: float, mask: NDArray[np.bool_] | None
+    ) -> None:
+        """Raise DataError where a frame has another shape or type than the camera's, or its time does not rise."""
+        size = (self.camera.height, self.camera.width)
+        if rgb.shape != (*size, 3) or rgb.dtype != np.uint8:
+            raise DataError(f"frame at {t:.6f} s: rgb is {rgb.dtype} {rgb.shape}, not uint8 {(*size, 3)}")
+        if depth_m.shape != size or not np.issubdtype(depth_m.dtype, np.floating):
+            raise DataError(f"frame at {t:.6f} s: depth is {depth_m.dtype} {depth_m.shape}, not float {size} in m")
+        if mask is not None and (mask.shape != size or mask.dtype != np.bool_):
+            raise DataError(f"frame at {t:.6f} s: mask is {mask.dtype} {mask.shape}, not bool {size}")
+        if self._latest_t is not None and t <= self._latest_t:
+            raise DataError(f"frame at {t:.6f} s: not after the frame before it, at {self._latest_t:.6f} s")
+        self._latest_t = t
 
     def finish(self) -> None:
         """Wait for mapping that runs beside tracking, and adjust the whole map; the trajectory is better for it."""

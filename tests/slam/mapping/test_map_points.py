@@ -5,7 +5,7 @@ from plane_world import CAMERA, features_at
 
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.map_points import cull
+from cohdc_train.slam.mapping.map_points import cull, drop_points
 
 ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them
 
@@ -51,3 +51,23 @@ def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
     cull(world, newest=3)
     assert world.seen_by[: world.size].tolist() == [0, 2, 0, 1]
     assert first.point_ids.tolist() == [-1, TWICE, -1, -1]
+
+
+def test_dropped_point_leaves_every_keyframe_however_many_saw_it() -> None:
+    """A point remembers eight observers; the drop reaches the other four too."""
+    world = Map(CAMERA)
+    keyframes = [keyframe(0, [-1, -1, -1, -1]), *(keyframe(index, [0, -1, -1, -1]) for index in range(1, 12))]
+    world.add_keyframe(keyframes[0])
+    world.add_points(keyframes[0], np.array([0]))
+    for other in keyframes[1:]:
+        world.add_keyframe(other)
+    assert world.seen_by[0] == 12
+    drop_points(world, np.array([0]))
+    assert world.seen_by[0] == 0
+    assert all(other.point_ids[0] == -1 for other in keyframes)
+
+
+def test_grown_map_has_no_merged_points_in_its_new_rows() -> None:
+    world = Map(CAMERA)
+    world._reserve(3000)
+    np.testing.assert_array_equal(world.became, -1)

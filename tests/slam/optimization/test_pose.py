@@ -186,3 +186,13 @@ def test_a_problem_refuses_unsorted_cameras() -> None:
     seen = Observations(np.zeros((2, 2)), np.zeros(2), np.ones(2), np.ones(2))
     with pytest.raises(ValueError, match="sorted by camera"):
         Problem(np.array([1, 0]), np.array([0, 0]), seen, np.array([True, True]))
+
+
+def test_too_few_points_for_a_pose_are_still_judged() -> None:
+    rng = np.random.default_rng(0)
+    T_cw, points = exp_se3(rng.normal(size=6) * 0.1), cloud(rng, 5)
+    seen = observe(T_cw, points, rng)
+    seen.pixels[2] += 50.0
+    pose, inlier = optimize_pose(T_cw, points, seen, WEIGHING)
+    np.testing.assert_array_equal(pose, T_cw)
+    assert inlier.tolist() == [True, True, False, True, True]

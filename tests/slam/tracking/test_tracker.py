@@ -5,8 +5,11 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, render, room
 
+from cohdc_train.errors import DataError
+from cohdc_train.slam.config import MAX_KEYPOINTS
 from cohdc_train.slam.features.keypoints import Corners, Features
 from cohdc_train.slam.features.matching import Matches, Projected, match_projected, one_to_one
+from cohdc_train.slam.features.orb import FeatureExtractor
 from cohdc_train.slam.frame import Pose
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
 from cohdc_train.slam.tracking.tracker import Tracker
@@ -188,3 +191,26 @@ def test_matches_are_one_to_one_and_clear() -> None:
     assert points.tolist() == [0]
     assert corners.tolist() == [0]
     assert len(Matches(points, corners)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": BLACK.astype(np.float32)}, r"rgb is float32 \(240, 320, 3\), not uint8"),
+        ({"rgb": BLACK[:200]}, r"rgb is uint8 \(200, 320, 3\), not uint8 \(240, 320, 3\)"),
+        ({"depth": (1000 * NOTHING).astype(np.uint16)}, r"depth is uint16 .*, not float \(240, 320\) in m"),
+        ({"mask": np.zeros((240, 320), dtype=np.uint8)}, r"mask is uint8 .*, not bool"),
+        ({"t": 1.0}, r"frame at 1\.000000 s: not after the frame before it, at 1\.000000 s"),
+    ],
+)
+def test_frame_that_does_not_fit_is_refused(changes: dict[str, object], message: str) -> None:
+    tracker = Tracker(CAMERA, features=500)
+    tracker.track(BLACK, NOTHING, 1.0)
+    frame = {"rgb": BLACK, "depth": NOTHING, "t": 2.0, "mask": None} | changes
+    with pytest.raises(DataError, match=message):
+        tracker.track(frame["rgb"], frame["depth"], frame["t"], frame["mask"])
+    assert not tracker.track(BLACK, NOTHING, 3.0).tracked
+
+
+def test_number_of_keypoints_has_one_default() -> None:
+    assert Tracker(CAMERA).budget == FeatureExtractor(CAMERA).budget == MAX_KEYPOINTS
