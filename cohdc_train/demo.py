@@ -160,7 +160,7 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
     By the command line, which Lightning starts once more for the second process of the two that configs/demo.yaml asks
     for.
     """
-    from cohdc_train.validate import validate
+    from cohdc_train.validation import validate
 
     options = {
         "--config": "demo.yaml",
@@ -177,7 +177,7 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
 
 
 def _export(out: Path) -> None:
-    from cohdc_train.export import export
+    from cohdc_train.exporter.export import export
 
     export(out / "train" / "best.ckpt", out / "model.onnx", out / "data" / "images")
 
@@ -191,7 +191,7 @@ def _slam(sequence: Path, out: Path, model: Path | None, seed: int) -> dict[str,
 
 
 def _report(out: Path, scores: dict[str, float], clock: Clock) -> None:
-    from cohdc_train.predict import predict
+    from cohdc_train.prediction.predict import predict
     from cohdc_train.report import Table, write_report
 
     frames = sorted((out / "sequence" / "rgb").iterdir())

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from cohdc_train.bench import _fit_options, bench
-from cohdc_train.bench import entries as entries_module
-from cohdc_train.bench.entries import ROWS, Entry, row_config
+from cohdc_train.bench import rows as entries_module
+from cohdc_train.bench.rows import ROWS, Entry, row_config
 from cohdc_train.bench.speed import frame_rates, spread
 from cohdc_train.bench.table import _row, as_text, plot
 from cohdc_train.bench.training import call, train
@@ -54,7 +54,7 @@ def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monke
 
         return run
 
-    monkeypatch.setattr("cohdc_train.export.timing.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("cohdc_train.exporter.interleaved_timing.time.perf_counter", lambda: clock[0])
     pictures = [np.full((8, 8, 3), i, np.uint8) for i in range(3)]
     rates = frame_rates({"slow": runner("slow", 0.5), "fast": runner("fast", 0.125)}, pictures)
     assert order == [(name, i) for i in (0, 0, 1, 2) for name in ("slow", "fast")]

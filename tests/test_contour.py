@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cohdc_train.contour import METHODS, BeetleSearch, Method, Polygon, joined, rasterize, simplify, trace, vertices
-from cohdc_train.contour.coverage import Coverage, crossing
+from cohdc_train.contour.polygon_iou import Coverage, crossing
 
 SIZE = (96, 128)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cohdc_train.contour import BeetleSearch, Polygon, rasterize, simplify, trace, vertices
-from cohdc_train.contour.beetle import _Beetles
-from cohdc_train.contour.bracket import Bracket
-from cohdc_train.contour.coverage import Coverage, crossing
+from cohdc_train.contour.beetle_search import _Beetles
+from cohdc_train.contour.polygon_iou import Coverage, crossing
+from cohdc_train.contour.tolerance_search import Bracket
 
 SIZE = (96, 128)
 

@@ -10,7 +10,7 @@ from cohdc_train.cli import main
 from cohdc_train.demo import Plan, demo
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import MANIFEST, files_below
-from cohdc_train.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import read_tum
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
 

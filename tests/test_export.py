@@ -16,9 +16,11 @@ import torch
 from cohdc_train import signature
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError, ContractError, ExportError
-from cohdc_train.export import command, export, parity
-from cohdc_train.export.graph import count_flops
-from cohdc_train.export.pictures import drawn_images
+from cohdc_train.exporter import parity
+from cohdc_train.exporter import steps as command
+from cohdc_train.exporter.export import export
+from cohdc_train.exporter.graph import count_flops
+from cohdc_train.exporter.sample_images import drawn_images
 from cohdc_train.models import Detector, MaskRCNN, detect
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tool_loader import load_tool
 
-from cohdc_train.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory, write_tum
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCKERFILES = sorted((ROOT / "docker").glob("*.Dockerfile"))

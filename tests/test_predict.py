@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from cohdc_train.contour import Polygon, rasterize
 from cohdc_train.errors import ContractError, DataError
 from cohdc_train.files import MANIFEST
-from cohdc_train.predict import predict, predict_pictures
-from cohdc_train.predict.drawing import draw
-from cohdc_train.predict.pictures import Picture, read_pictures
+from cohdc_train.prediction.drawing import draw
+from cohdc_train.prediction.image_sources import Picture, read_pictures
+from cohdc_train.prediction.predict import predict, predict_pictures
 from cohdc_train.segmenter import Detections
 
 BOXES = np.array([[20.0, 10.0, 60.0, 90.0], [70.5, 40.0, 110.5, 60.0], [5.0, 95.0, 9.0, 99.0]], np.float32)

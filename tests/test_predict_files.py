@@ -14,8 +14,8 @@ from test_predict import Fake, picture
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import files_below
-from cohdc_train.predict import predict, predict_pictures
-from cohdc_train.predict.pictures import Picture, read_pictures
+from cohdc_train.prediction.image_sources import Picture, read_pictures
+from cohdc_train.prediction.predict import predict, predict_pictures
 
 FLOOR = 0.93
 

@@ -11,7 +11,7 @@ from onnx import helper, numpy_helper
 from onnxruntime import InferenceSession, SessionOptions
 
 from cohdc_train import signature
-from cohdc_train.export.quantization import quantize
+from cohdc_train.exporter.quantization import quantize
 
 CHANNELS = 8
 

@@ -11,7 +11,8 @@ import pytest
 
 from cohdc_train.errors import DataError
 from cohdc_train.report import Table, report, write_report
-from cohdc_train.trajectory import Trajectory, score, write_tum
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory, write_tum
 
 
 class Page(HTMLParser):

@@ -11,7 +11,7 @@ from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
 from cohdc_train.cli import main
 from cohdc_train.errors import ContractError
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.segmenter.foreign import MOST
+from cohdc_train.segmenter.adapters import MOST
 
 CANVAS = (64, 96)
 CLASSES = ("person", "dog", "car")

@@ -14,24 +14,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cohdc_train import trajectory as trajectories
 from cohdc_train.errors import DataError
-from cohdc_train.trajectory import (
-    Trajectory,
-    align_umeyama,
-    all_pairs,
-    associate,
-    ate,
-    coverage,
-    evaluate,
-    match,
-    pairs_apart,
-    read_tum,
-    rpe,
-    score,
-    statistics,
-    write_tum,
-)
+from cohdc_train.trajectory.association import associate, match
+from cohdc_train.trajectory.evaluate import coverage, evaluate, score
+from cohdc_train.trajectory.metrics import align_umeyama, all_pairs, ate, pairs_apart, rpe, statistics
+from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
+from cohdc_train.trajectory.trajectory import trajectory as trajectories
 
 TUM = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum"
 needs_tum = pytest.mark.skipif(not TUM.is_dir(), reason=f"{TUM} is absent")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.export.timing import Image, K, seconds_in_turn
+from cohdc_train.exporter.interleaved_timing import Image, K, seconds_in_turn
 from cohdc_train.models import detect
 from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.train.module import MaskRCNNModule

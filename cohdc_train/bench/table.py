@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cohdc_train.bench.entries import ROWS, Entry, finished_entry, row_config, trained_entry
+from cohdc_train.bench.rows import ROWS, Entry, finished_entry, row_config, trained_entry
 from cohdc_train.bench.speed import Rate, frame_rates, peak_memory, runners_of, spread
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.datamodule import CocoDataModule

@@ -4,7 +4,7 @@ Points are (x, y) in px with the origin at the corner of the first pixel, as COC
 from (j, i) to (j + 1, i + 1) and belongs to a polygon when its centre does (even-odd rule over all rings).
 """
 
-from cohdc_train.contour.beetle import BeetleSearch
+from cohdc_train.contour.beetle_search import BeetleSearch
 from cohdc_train.contour.polygons import Polygon, joined, rasterize, trace, vertices
 from cohdc_train.contour.simplification import METHODS, Method, simplify
 

@@ -8,10 +8,10 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from cohdc_train.contour.beetle import BeetleSearch, search_vertices
-from cohdc_train.contour.bracket import Bracket
-from cohdc_train.contour.coverage import Coverage
+from cohdc_train.contour.beetle_search import BeetleSearch, search_vertices
+from cohdc_train.contour.polygon_iou import Coverage
 from cohdc_train.contour.polygons import FloatArray, Polygon, vertices
+from cohdc_train.contour.tolerance_search import Bracket
 
 Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
 METHODS: tuple[Method, ...] = get_args(Method)

@@ -12,14 +12,14 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from cohdc_train.data.coco import CocoSplit, read_split
-from cohdc_train.data.doctor import summary
-from cohdc_train.data.examination import examine
-from cohdc_train.data.findings import KINDS
-from cohdc_train.data.formats import Source, SourceImage
-from cohdc_train.data.formats_labelme import read_labelme
-from cohdc_train.data.formats_via import read_via
-from cohdc_train.data.formats_voc import read_voc
-from cohdc_train.data.formats_yolo import read_yolo
+from cohdc_train.data.doctor.annotation_checks import examine
+from cohdc_train.data.doctor.doctor import summary
+from cohdc_train.data.doctor.issues import KINDS
+from cohdc_train.data.formats.base import Source, SourceImage
+from cohdc_train.data.formats.labelme import read_labelme
+from cohdc_train.data.formats.via import read_via
+from cohdc_train.data.formats.voc import read_voc
+from cohdc_train.data.formats.yolo import read_yolo
 from cohdc_train.data.layout import find_split
 from cohdc_train.errors import DataError
 from cohdc_train.files import link_or_copy, new_folder, write_text

@@ -19,7 +19,7 @@ from cohdc_train.data.annotations import CocoImage, read_image
 from cohdc_train.data.canvas import choose_canvas
 from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder, read_split
 from cohdc_train.data.layout import CocoPaths, find_split
-from cohdc_train.data.train_set import CocoTrainSet, Target
+from cohdc_train.data.train_dataset import CocoTrainSet, Target
 from cohdc_train.data.transforms import Augmentation, blank_padding, photometric_augmentation
 from cohdc_train.errors import DataError
 

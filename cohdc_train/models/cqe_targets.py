@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 torch's own name for it
 from torch import Tensor
 
-from cohdc_train.models.true_masks import TrueMasks
+from cohdc_train.models.gt_masks import TrueMasks
 
 Goal = Literal["iou", "ciou", "boundary_iou", "min"]
 BAND = 0.02  # width of Boundary IoU's band, as a share of the image's diagonal

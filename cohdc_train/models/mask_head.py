@@ -7,7 +7,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from torchvision.models.detection.mask_rcnn import MaskRCNNPredictor
 
-from cohdc_train.models.true_masks import TrueMasks
+from cohdc_train.models.gt_masks import TrueMasks
 
 MaskSize = Literal[28, 56]
 

@@ -17,15 +17,15 @@ from torchvision.models.detection.roi_heads import RoIHeads, fastrcnn_loss
 from torchvision.ops import FeaturePyramidNetwork, MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
 
-from cohdc_train.models.cqe import CQEHead, Fusion, cqe_loss
+from cohdc_train.models.backbone import MEAN, STD, Norm
+from cohdc_train.models.cqe_head import CQEHead, Fusion, cqe_loss
 from cohdc_train.models.cqe_targets import Goal, band_of, cqe_targets
+from cohdc_train.models.gt_masks import TrueMasks
 from cohdc_train.models.mask_head import MaskSize, mask_loss, mask_predictor
 from cohdc_train.models.mobilenet_v1 import MobileNetV1
 from cohdc_train.models.mobilenet_v2 import MobileNetV2
 from cohdc_train.models.resnet import Depth, HDCResNet
 from cohdc_train.models.rpn import build_rpn, in_crowd
-from cohdc_train.models.staged import MEAN, STD, Norm
-from cohdc_train.models.true_masks import TrueMasks
 
 Target = dict[str, Any]
 STRIDES = (4, 8, 16, 32)  # of the backbone's four stages

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from cohdc_train.models.staged import (
+from cohdc_train.models.backbone import (
     MEAN,
     STD,
     Norm,

@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
-from cohdc_train.models.staged import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights
+from cohdc_train.models.backbone import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights
 
 _PARTS = ((0, 2), (2, 4), (4, 7), (7, 14), (14, 18))  # modules of the stem and the stages of strides 4, 8, 16, 32
 

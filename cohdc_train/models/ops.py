@@ -1,7 +1,7 @@
 """Operators that keep the detector exportable: every inner shape but one is known beforehand.
 
 The one is how many detections there are to segment. Each is an ordinary torch function wrapped as a custom operator;
-`cohdc_train.export` says what it is in ONNX.
+`cohdc_train.exporter.export` says what it is in ONNX.
 """
 
 import torch

@@ -6,7 +6,7 @@ from typing import Literal
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
-from cohdc_train.models.staged import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights, rounded
+from cohdc_train.models.backbone import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights, rounded
 
 Depth = Literal[18, 34, 50, 101]
 _BLOCKS: dict[int, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {

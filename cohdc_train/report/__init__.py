@@ -14,7 +14,9 @@ import yaml
 from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, list_files, write_text
 from cohdc_train.report.plots import Run, plot_errors, plot_over_time, plot_paths
-from cohdc_train.trajectory import Trajectory, align_umeyama, match, read_tum
+from cohdc_train.trajectory.association import match
+from cohdc_train.trajectory.metrics import align_umeyama
+from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

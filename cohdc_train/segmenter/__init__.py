@@ -1,6 +1,6 @@
 """An ONNX file -> detections (onnxruntime, never torch)."""
 
 from cohdc_train.segmenter.detections import Detections
-from cohdc_train.segmenter.session import Segmenter
+from cohdc_train.segmenter.segmenter import Segmenter
 
 __all__ = ["Detections", "Segmenter"]

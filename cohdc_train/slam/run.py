@@ -25,7 +25,7 @@ from cohdc_train.slam.runtime.workers import workers
 from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import Viewer
-from cohdc_train.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 
 def slam(

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.synth import people as bodies
+from cohdc_train.synth.camera_motion import Doubles
 from cohdc_train.synth.mesh import Floats, Mesh, yaw_rotation
-from cohdc_train.synth.motion import Doubles
 from cohdc_train.synth.textures import Texture
-from cohdc_train.synth.walks import Walk
+from cohdc_train.synth.walk_paths import Walk
 
 _BLENDS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [1 / 3] * 3])
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder
 from cohdc_train.synth import people as bodies
-from cohdc_train.synth.annotation import annotate
+from cohdc_train.synth.coco_annotation import annotate
 from cohdc_train.synth.mesh import Floats, join
+from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, Camera, render
-from cohdc_train.synth.scene import Lighting, Room, furnished_room, texture_detail
+from cohdc_train.synth.room import Lighting, Room, furnished_room, texture_detail
 from cohdc_train.synth.sensor import exposure, photograph, smear
-from cohdc_train.synth.streams import stream
 
 IMAGES_PER_ROOM = 5
 PEOPLE_PER_ROOM = 3

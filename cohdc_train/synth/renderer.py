@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.synth.mesh import Floats, Mesh
-from cohdc_train.synth.scene import Lighting
+from cohdc_train.synth.room import Lighting
 from cohdc_train.synth.textures import Texture
 
 

@@ -8,15 +8,16 @@ import cv2
 import numpy as np
 
 from cohdc_train.errors import DataError
-from cohdc_train.synth import furniture, walks
+from cohdc_train.synth import furniture
 from cohdc_train.synth import people as bodies
+from cohdc_train.synth import walk_paths as walks
 from cohdc_train.synth.actors import Actor, Sitter, Thing, Walker
+from cohdc_train.synth.camera_motion import CameraMotion, Doubles, camera_path, loop_heading, sway
 from cohdc_train.synth.mesh import join
-from cohdc_train.synth.motion import CameraMotion, Doubles, camera_path, loop_heading, sway
+from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, Camera, View, render
-from cohdc_train.synth.scene import Room, furnished_room, plain_room, round_room, texture_detail
-from cohdc_train.synth.streams import stream
-from cohdc_train.synth.walks import Walk
+from cohdc_train.synth.room import Room, furnished_room, plain_room, round_room, texture_detail
+from cohdc_train.synth.walk_paths import Walk
 
 Action = Literal["walk", "stop_and_go", "fill_view", "sit"]
 RATE = 30.0  # frames per second

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder
 from cohdc_train.synth.actors import fastest
-from cohdc_train.synth.motion import MOTIONS, CameraMotion, Doubles
+from cohdc_train.synth.camera_motion import MOTIONS, CameraMotion, Doubles
+from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Camera
 from cohdc_train.synth.scenario import RATE, TRUTH_PER_FRAME, Scene, Setting, draw_scene
 from cohdc_train.synth.sensor import DEPTH_SCALE, exposure, measure_depth, photograph
-from cohdc_train.synth.streams import stream
 
 FIRST_STAMP = 1305031102.175304  # s
 MOVES = 0.05  # m/s: an actor none of whose points is faster stands still

@@ -16,7 +16,6 @@ from lightning.pytorch.utilities import rank_zero_info
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path, model_path
-from cohdc_train.train.allocator import keep_freed_memory
 from cohdc_train.train.batch_size import largest_batch
 from cohdc_train.train.budget import FitTrainer, default_epochs, is_bounded, training_limits, validation_interval
 from cohdc_train.train.ema import ema
@@ -26,12 +25,13 @@ from cohdc_train.train.initial_weights import (
     resolve_backbone_lr,
     resolve_network,
 )
+from cohdc_train.train.malloc import keep_freed_memory
 from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.out_folder import check_out, claim_out
-from cohdc_train.train.pictures import ValidationPictures
 from cohdc_train.train.progress import ProgressReporter
 from cohdc_train.train.sanity import find_learning_rate, overfit_verdict
 from cohdc_train.train.summary import summary_lines, training_facts
+from cohdc_train.train.validation_figures import ValidationPictures
 
 _USAGE = "cohdc fit DATA [--config FILE.yaml] [--minutes N | --epochs N] [--out DIR] [--OPTION VALUE ...]"
 _DESCRIPTION = (

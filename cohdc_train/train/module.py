@@ -11,9 +11,9 @@ from torch import Tensor
 
 from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
+from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
-from cohdc_train.train.exported import load_exported, read_exported
-from cohdc_train.train.metrics import Results, SegmentationMetrics
+from cohdc_train.train.onnx_weights import load_exported, read_exported
 from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, training_progress
 
 _OF_CLASSES = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.", "cqe.quality.")

@@ -7,7 +7,7 @@ import lightning.pytorch as pl
 from lightning.pytorch.tuner.tuning import Tuner
 
 from cohdc_train.files import write_bytes
-from cohdc_train.train.plots import plot_lr_find
+from cohdc_train.train.validation_plots import plot_lr_find
 
 _STEPS = 100
 _RANGE = (1e-6, 3e-2)  # beyond it AdamW diverges

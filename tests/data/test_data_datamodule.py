@@ -127,7 +127,8 @@ _PEAK = """
 import resource, sys
 import torch
 from cohdc_train.data.datamodule import CocoDataModule
-from cohdc_train.models import MaskRCNN, NetworkConfig
+from cohdc_train.models import MaskRCNN
+from cohdc_train.models import NetworkConfig
 
 torch.set_num_threads(1)
 data = CocoDataModule(sys.argv[1], canvas=(256, 384), batch_size=1, workers=0)

@@ -17,10 +17,10 @@ from torchvision.models.detection.image_list import ImageList
 from torchvision.ops import box_iou
 
 from cohdc_train.cli import main
-from cohdc_train.data.anchors import best_overlap
 from cohdc_train.data.annotations import fills
 from cohdc_train.data.datamodule import CocoDataModule
-from cohdc_train.data.findings import KINDS
+from cohdc_train.data.doctor.anchor_recall import best_overlap
+from cohdc_train.data.doctor.issues import KINDS
 from cohdc_train.data.layout import CocoPaths
 from cohdc_train.errors import DataError
 from cohdc_train.models import MaskRCNN, NetworkConfig

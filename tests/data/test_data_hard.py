@@ -18,8 +18,10 @@ _TRAIN = """
 import sys
 import torch
 from cohdc_train.data.datamodule import CocoDataModule
-from cohdc_train.models import MaskRCNN, NetworkConfig, detect
-from cohdc_train.train.metrics import SegmentationMetrics
+from cohdc_train.models import MaskRCNN
+from cohdc_train.models import NetworkConfig
+from cohdc_train.models import detect
+from cohdc_train.metrics.coco_metrics import SegmentationMetrics
 
 def peak():
     return int(open("/proc/self/status").read().partition("VmHWM:")[2].split()[0]) // 1024

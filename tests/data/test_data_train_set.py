@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cohdc_train.data.annotations import CocoImage, CocoObject
-from cohdc_train.data.train_set import CocoTrainSet
+from cohdc_train.data.train_dataset import CocoTrainSet
 from cohdc_train.data.transforms import Augmentation, mask_boxes
 
 STILL = Augmentation(flip=0.0, scale_jitter=(1.0, 1.0), photometric=False)

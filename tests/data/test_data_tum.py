@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import pytest
 
 from cohdc_train.cli import main
-from cohdc_train.data.tum import SEQUENCES, tum
+from cohdc_train.data.tum_download import SEQUENCES, tum
 from cohdc_train.errors import DataError
 
 NAME = "rgbd_dataset_freiburg3_walking_xyz"

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cohdc_train.models.cqe import CQEHead, cqe_loss
+from cohdc_train.models.cqe_head import CQEHead, cqe_loss
 
 
 def test_loss_is_half_the_squared_error_over_positive_targets():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from cohdc_train.models.cqe_targets import band_of, boundary_iou, cqe_targets
-from cohdc_train.models.true_masks import TrueMasks
+from cohdc_train.models.gt_masks import TrueMasks
 
 
 def _true(masks):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import exp_se3
-from cohdc_train.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory, write_tum
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
 CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\ndepth_scale: 5000\n"

@@ -23,7 +23,7 @@ from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded
 from cohdc_train.slam.run import run_source, slam
-from cohdc_train.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import read_tum
 
 SIX = {"rmse", "mean", "median", "std", "min", "max"}
 FRAMES = 36

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cohdc_train.synth.annotation import annotate, outlines, run_lengths
+from cohdc_train.synth.coco_annotation import annotate, outlines, run_lengths
 
 mask_api = pytest.importorskip("pycocotools.mask")
 # pycocotools' arrays lack numpy 2's copy keyword

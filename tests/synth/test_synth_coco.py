@@ -10,9 +10,9 @@ import pytest
 
 from cohdc_train.errors import DataError
 from cohdc_train.synth import coco
-from cohdc_train.synth.annotation import annotate
 from cohdc_train.synth.coco import SMALLEST_SHARE, Picture, draw_stage, take_picture
-from cohdc_train.synth.streams import stream
+from cohdc_train.synth.coco_annotation import annotate
+from cohdc_train.synth.random_streams import stream
 
 pytest.importorskip("embreex")
 pycocotools = pytest.importorskip("pycocotools.coco")
@@ -69,7 +69,7 @@ def test_crumbs_of_people_are_a_crowd_that_scores_ignore() -> None:
 
 def test_annotations_are_the_rendered_masks(folder: Path) -> None:
     rng = stream(5, "coco-train", 0)
-    from cohdc_train.synth.scene import texture_detail
+    from cohdc_train.synth.room import texture_detail
 
     stage = draw_stage(rng, texture_detail(SIZE))
     api = pycocotools.COCO(folder / "instances_train.json")

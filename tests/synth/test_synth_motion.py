@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cohdc_train.synth.motion import MOTIONS, camera_path, loop_heading
-from cohdc_train.synth.walks import approach, crowd, errands, led_round, rolled, stop_and_go
+from cohdc_train.synth.camera_motion import MOTIONS, camera_path, loop_heading
+from cohdc_train.synth.walk_paths import approach, crowd, errands, led_round, rolled, stop_and_go
 
 TIMES = np.arange(300) / 30
 

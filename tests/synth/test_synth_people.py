@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cohdc_train.synth.people import Person, draw_person, draw_pose, person_mesh, stride, walking
-from cohdc_train.synth.streams import stream
+from cohdc_train.synth.random_streams import stream
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cohdc_train.synth import mesh as solids
 from cohdc_train.synth.renderer import Atlas, Camera, cast, rays, render
-from cohdc_train.synth.scene import Lighting
+from cohdc_train.synth.room import Lighting
 
 pytest.importorskip("embreex")
 

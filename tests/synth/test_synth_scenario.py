@@ -13,7 +13,7 @@ from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.synth import sequence
 from cohdc_train.synth.actors import Walker, fastest
-from cohdc_train.synth.motion import CameraMotion
+from cohdc_train.synth.camera_motion import CameraMotion
 from cohdc_train.synth.renderer import Camera, View, render
 from cohdc_train.synth.scenario import Scene, Setting, draw_scene
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.export.graph import write_graph
-from cohdc_train.export.pictures import drawn_images
-from cohdc_train.export.quantization import quantize
+from cohdc_train.exporter.graph import write_graph
+from cohdc_train.exporter.quantization import quantize
+from cohdc_train.exporter.sample_images import drawn_images
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
 from cohdc_train.models.frozen_norm import FrozenNorm
 from cohdc_train.train.module import MaskRCNNModule

@@ -8,7 +8,7 @@ import pytest
 
 ROUNDS = """
 import ctypes, resource, sys
-from cohdc_train.train.allocator import keep_freed_memory
+from cohdc_train.train.malloc import keep_freed_memory
 libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 libc.free.argtypes, libc.memset.argtypes = [ctypes.c_void_p], [ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t]

@@ -7,8 +7,8 @@ import pytest
 import torch
 from test_train_metrics import detection, square, truth_of
 
-from cohdc_train.train.matching import ImageMatch, confusion_matrix, match_images, ranked
-from cohdc_train.train.metrics import Results, SegmentationMetrics
+from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
+from cohdc_train.metrics.matching import ImageMatch, confusion_matrix, match_images, ranked
 
 LEFT, RIGHT, EMPTY = [10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0], [10.0, 38.0, 30.0, 58.0]
 LOWER = [10.0, 14.0, 30.0, 34.0]  # overlaps LEFT by 16 of 24 rows

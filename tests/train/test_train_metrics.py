@@ -13,7 +13,7 @@ from pycocotools import mask as rle
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from cohdc_train.train.metrics import (
+from cohdc_train.metrics.coco_metrics import (
     SegmentationMetrics,
     average_precision,
     calibration,

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from cohdc_train.train import metrics
+from cohdc_train.metrics import coco_metrics as metrics
 
 
 def test_images_that_two_processes_saw_count_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,11 +20,17 @@ from test_train_metrics import SIZE, calibration, random_problem, square, truth_
 from cohdc_train.cli import main
 from cohdc_train.data.annotations import CocoImage
 from cohdc_train.files import MANIFEST
-from cohdc_train.train import pictures
+from cohdc_train.metrics.coco_metrics import IOUS, Results, precision_table
+from cohdc_train.train import validation_figures as pictures
 from cohdc_train.train.cli import FitCommand, fit
-from cohdc_train.train.metrics import IOUS, Results, precision_table
-from cohdc_train.train.pictures import ValidationPictures, draw_validation
-from cohdc_train.train.plots import class_names, plot_calibration, plot_confusion, plot_log, plot_precision_recall
+from cohdc_train.train.validation_figures import ValidationPictures, draw_validation
+from cohdc_train.train.validation_plots import (
+    class_names,
+    plot_calibration,
+    plot_confusion,
+    plot_log,
+    plot_precision_recall,
+)
 
 SHORT = ("--trainer.limit_train_batches=1", "--trainer.limit_val_batches=1")
 VALIDATION = {"best.jpg", "worst.jpg", "pr_curves.png", "calibration.png", "confusion.png"}

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pycocotools import mask as rle
 
-from cohdc_train.train.run_lengths import boundary_rle, to_rle, window_boundary, window_rle
+from cohdc_train.metrics.rle import boundary_rle, to_rle, window_boundary, window_rle
 
 SIZE = (60, 80)
 SEEDS = st.integers(0, 10_000)

@@ -179,7 +179,7 @@ def validate_file(args: argparse.Namespace, gate: Gate) -> None:
     from dataclasses import replace
 
     from cohdc_train.segmenter import Segmenter
-    from cohdc_train.validate import score_segmenter
+    from cohdc_train.validation import score_segmenter
 
     split = pictures(args).folder.val
     split = replace(split, images=split.images[: args.val_images])
@@ -198,7 +198,7 @@ def mebibytes(line: str) -> int:
 def work(side: str, phase: str, args: argparse.Namespace, pipe: Connection) -> None:
     """A worker process: one side of one phase."""
     if side == "ours":  # as `cohdc fit` and `cohdc validate` do
-        from cohdc_train.train.allocator import keep_freed_memory
+        from cohdc_train.train.malloc import keep_freed_memory
 
         keep_freed_memory()
     import logging

@@ -151,8 +151,8 @@ def score_ours(module: Any, data: Path) -> dict[str, float]:
 
     from cohdc_train.data.annotations import read_image
     from cohdc_train.data.datamodule import CocoDataModule
+    from cohdc_train.metrics.coco_metrics import encode
     from cohdc_train.models import detect, fused
-    from cohdc_train.train.metrics import encode
 
     split = CocoDataModule(data, module.class_names).folder.val
     network = fused(module.network)

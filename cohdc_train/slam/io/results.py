@@ -13,7 +13,8 @@ import yaml
 from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, publish
 from cohdc_train.slam.frame import FrameRecord
-from cohdc_train.trajectory import Trajectory, score, write_tum
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory, write_tum
 
 _VERB = "slam"
 _NAMES = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.trajectory import associate
+from cohdc_train.trajectory.association import associate
 
 
 @dataclass(frozen=True)

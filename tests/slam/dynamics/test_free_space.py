@@ -25,7 +25,8 @@ from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.reprojection import Observations, Weighing
 from cohdc_train.slam.runner import play
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 WEIGHING = Weighing(CAMERA)
 LENS = replace(CAMERA, k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)

@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from cohdc_train.slam.dynamics.moving_surfaces import JUMP, Bits, Movers, surfaces
 from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 SHAPE = (30, 40)
 NOWHERE = np.zeros(SHAPE, dtype=np.bool_)

@@ -20,7 +20,7 @@ from tool_loader import load_tool
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
-from cohdc_train.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import read_tum
 
 FRAMES = 8
 

@@ -17,7 +17,8 @@ from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import Weighing, chi_square
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 180
 TRUTH = way_round(FRAMES)

@@ -14,7 +14,8 @@ from cohdc_train.slam.mapping.local_bundle_adjustment import WINDOW, Solution, c
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.patch_refiner import affine
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 ROUND = 20  # frames until the hand is back
 ROUNDS = 4

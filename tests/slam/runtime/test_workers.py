@@ -28,7 +28,8 @@ from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, close_win
 from cohdc_train.slam.runtime.async_masks import AsyncMasks
 from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 LONG = 20.0  # s: no wait of a thread here takes that long unless it hangs
 

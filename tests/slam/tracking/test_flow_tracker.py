@@ -18,7 +18,8 @@ from cohdc_train.slam.optimization.reprojection import Prior
 from cohdc_train.slam.tracking.flow_tracker import FlowTracker, Followed
 from cohdc_train.slam.tracking.motion_model import Expectation
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 31
 STILL = Expectation(Prior(np.eye(4), np.zeros((6, 6))), calm=False)

@@ -12,7 +12,8 @@ from cohdc_train.slam.optimization.reprojection import Observations, Prior, Weig
 from cohdc_train.slam.tracking import motion_model as motion_module
 from cohdc_train.slam.tracking.motion_model import _EXACT, ACCELERATION, Motion
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 SURE = 1e12 * np.eye(6)
 VELOCITY = np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.3])  # m/s, rad/s

@@ -13,7 +13,8 @@ from cohdc_train.slam.features.orb import FeatureExtractor
 from cohdc_train.slam.frame import Pose
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory import Trajectory, score
+from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory
 
 BLACK = np.zeros((240, 320, 3), dtype=np.uint8)
 NOTHING = np.zeros((240, 320), dtype=np.float32)

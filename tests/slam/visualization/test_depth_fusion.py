@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from ply_reader import read_ply
 
 from cohdc_train.slam.run import slam
-from cohdc_train.trajectory import match, read_tum
+from cohdc_train.trajectory.association import match
+from cohdc_train.trajectory.trajectory import read_tum
 
 pytest.importorskip("embreex", reason="the renderer comes with the train extra")
 

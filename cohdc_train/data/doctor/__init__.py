@@ -1,0 +1,1 @@
+"""Faults of a COCO-format folder, and their fixes."""

@@ -1,0 +1,210 @@
+"""Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them (no torch)."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from cohdc_train.data.formats.base import (
+    IMAGE_SUFFIXES,
+    Source,
+    SourceImage,
+    SourceObject,
+    encode,
+    open_image,
+    read_lines,
+)
+from cohdc_train.data.formats.splits import TEST, TEST_LEFT_OUT, split_named
+from cohdc_train.errors import DataError
+
+# fmt: off
+VOC_NAMES = (
+    "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow", "diningtable", "dog",
+    "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train", "tvmonitor",
+)
+# fmt: on
+_BACKGROUND = frozenset(["background", "_background_"])
+_IGNORED = frozenset(["ignored", "__ignore__"])
+_VOID = 255
+_NUMBERS = ("P", "L", "1")  # modes of PNGs whose pixels are numbers
+_MODES = (*_NUMBERS, "RGB", "RGBA")
+Labels = NDArray[np.int32]
+
+
+class ClassTable(NamedTuple):
+    """names: of class i + 1 at index i. colours: 0xRRGGBB -> class (0 background, 255 void). painted: a file's."""
+
+    names: tuple[str, ...]
+    colours: dict[int, int]
+    painted: bool
+
+
+def read_voc(root: Path, names: Path | None = None) -> Source:
+    """JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/ with train.txt and val.txt.
+
+    Where there is no such split, trainval.txt or CVAT's default.txt is taken. The images of
+    test.txt are left out and counted, unless val.txt has them too. names: a file with a class per
+    line, or CVAT's labelmap.txt; without it the folder's labelmap.txt, else VOC's 20. An object's
+    class is that of most class pixels under it; 255 is void and belongs to nothing. Class ids keep
+    the order of the names.
+    Raises DataError in one line naming the file and the line.
+    """
+    table = _class_table(names or (root / "labelmap.txt" if (root / "labelmap.txt").is_file() else None))
+    source = Source(class_names=table.names)
+    pictures = {
+        path.relative_to(root / "JPEGImages").with_suffix("").as_posix(): path
+        for path in sorted((root / "JPEGImages").rglob("*"))
+        if path.suffix.lower() in IMAGE_SUFFIXES
+    }
+    lists = _lists(root)
+    tests = _leave_out_test(lists, source)
+    for split, listed in lists.items():
+        source.splits[split] = []
+        for number, stem in read_lines(listed):
+            if stem not in pictures:
+                raise DataError(f"{listed}:{number}: no image {stem!r} in {root / 'JPEGImages'}")
+            if split == "val" or stem not in tests:
+                source.splits[split].append(_read_image(root, stem, pictures[stem], table, source))
+        if not split:
+            source.drawn_from = listed.name
+    return source
+
+
+def _leave_out_test(lists: dict[str, Path], source: Source) -> set[str]:
+    """Take the list of the test split away, count its images, and return their names."""
+    listed = lists.pop(TEST, None)
+    if listed is None:
+        return set()
+    val = {stem for _, stem in read_lines(lists["val"])} if "val" in lists else set()
+    rows = read_lines(listed)
+    for number, stem in rows:
+        if stem not in val:
+            source.leave_out(TEST_LEFT_OUT, f"{listed}:{number}: {stem}")
+    return {stem for _, stem in rows}
+
+
+def _lists(root: Path) -> dict[str, Path]:
+    """Return split -> the file that lists its images; "" -> one that a split is drawn from."""
+    folder = root / "ImageSets" / "Segmentation"
+    files = {path.stem.lower(): path for path in sorted(folder.glob("*.txt"))}
+    named = {split: path for stem, path in files.items() if (split := split_named(stem))}
+    test = {TEST: named.pop(TEST)} if TEST in named else {}
+    if len(named) == 2:
+        return {"train": named["train"], "val": named["val"]} | test
+    whole = files.get("trainval") or files.get("default")
+    if whole is None:
+        places = "no train.txt and val.txt, and no trainval.txt or default.txt"
+        raise DataError(f"{folder}: {places}")
+    return {"": whole} | test
+
+
+def _class_table(path: Path | None) -> ClassTable:
+    """The classes of a file with a name per line, `name` or `name:R,G,B:...`; VOC's without a file."""
+    rows = [(0, name) for name in VOC_NAMES] if path is None else read_lines(path)
+    names: list[str] = []
+    colours = {0x000000: 0, _voc_colour(_VOID): _VOID}
+    painted = False
+    for number, row in rows:
+        name, _, rest = (part.strip() for part in row.partition(":"))
+        if row.startswith("#"):
+            continue
+        known = 0 if name in _BACKGROUND else _VOID if name in _IGNORED else len(names) + 1
+        if not name or name in names:
+            raise DataError(f"{path}:{number}: class {name!r} is listed twice" if name else f"{path}:{number}: no name")
+        if known == len(names) + 1:
+            names.append(name)
+        words = rest.partition(":")[0].split(",")
+        try:
+            colour = _packed(*map(int, words)) if rest.strip(": ") else _voc_colour(known)
+        except (TypeError, ValueError) as error:
+            raise DataError(f"{path}:{number}: not name:R,G,B") from error
+        painted |= bool(rest.strip(": "))
+        if 0 < colours.get(colour, 0) < _VOID:
+            raise DataError(f"{path}:{number}: {name} has the colour of {names[colours[colour] - 1]}")
+        colours[colour] = known
+    if not 0 < len(names) < _VOID:
+        raise DataError(f"{path}: {len(names)} classes; 1 to {_VOID - 1} can be told apart")
+    return ClassTable(tuple(names), colours, painted)
+
+
+def _packed(red: int, green: int, blue: int) -> int:
+    return red << 16 | green << 8 | blue
+
+
+def _voc_colour(index: int) -> int:
+    """VOC's colour of a class: every third bit of the index goes to red, green or blue, lowest bits highest."""
+    channels = [0, 0, 0]
+    for bit in range(8):
+        channels[bit % 3] |= (index >> bit & 1) << (7 - bit // 3)
+    return _packed(*channels)
+
+
+def _read_image(root: Path, stem: str, picture: Path, table: ClassTable, source: Source) -> SourceImage:
+    files = [root / folder / f"{stem}.png" for folder in ("SegmentationObject", "SegmentationClass")]
+    objects, void = _object_labels(files[0])
+    classes = _class_labels(files[1], table)
+    height, width = objects.shape
+    if classes.shape != objects.shape:
+        raise DataError(f"{files[1]}: {classes.shape[1]}x{classes.shape[0]}, {files[0]} {width}x{height}")
+    image = open_image(picture, (width, height))
+    found = []
+    for value in np.unique(objects):
+        if value in (0, void):
+            continue
+        mask = objects == value
+        votes = np.bincount(classes[mask], minlength=_VOID + 1)[1:_VOID]
+        where = f"{files[0]}: object {value}"
+        if votes.any():
+            found.append(SourceObject(table.names[int(votes.argmax())], encode(mask), where))
+        else:
+            source.leave_out("object without a pixel of a class under it", where)
+    return image.holding(found)
+
+
+def _object_labels(path: Path) -> tuple[Labels, int]:
+    """[H, W] number of the object at each pixel, 0 none; and the number that means void."""
+    with _open(path) as picture:
+        if picture.mode in _NUMBERS:
+            return np.asarray(picture).astype(np.int32), _VOID
+        return _colours(picture), _voc_colour(_VOID)
+
+
+def _class_labels(path: Path, table: ClassTable) -> Labels:
+    """[H, W] class at each pixel: 1..C, 0 background, 255 void."""
+    with _open(path) as picture:
+        if picture.mode in _NUMBERS and not (picture.mode == "P" and table.painted):
+            labels = np.asarray(picture).astype(np.int32)
+            unknown = labels[(labels > len(table.names)) & (labels != _VOID)]
+            if unknown.size:
+                raise DataError(f"{path}: class {unknown.max()} where there are {len(table.names)}")
+            return labels
+        colours = _colours(picture)
+    values, place = np.unique(colours, return_inverse=True)
+    unknown = [value for value in values.tolist() if value not in table.colours]
+    if unknown:
+        red, green, blue = int(unknown[0]).to_bytes(3, "big")
+        raise DataError(f"{path}: colour {red},{green},{blue} is no class's")
+    known = np.array([table.colours[value] for value in values.tolist()], dtype=np.int32)
+    return known[place.reshape(colours.shape)]
+
+
+def _colours(picture: Image.Image) -> Labels:
+    """[H, W] 0xRRGGBB."""
+    rgb = np.asarray(picture.convert("RGB")).astype(np.int32)
+    packed: Labels = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
+    return packed
+
+
+def _open(path: Path) -> Any:
+    try:
+        picture = Image.open(path)
+        picture.load()
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: does not exist") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as an image") from error
+    if picture.mode not in _MODES:
+        raise DataError(f"{path}: a PNG of mode {picture.mode}; a palette, 8-bit grey and RGB can be read")
+    return picture

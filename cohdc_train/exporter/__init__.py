@@ -1,0 +1,1 @@
+"""Checkpoint to ONNX, float32 and int8, each proven before it gets its name."""

@@ -1,0 +1,169 @@
+"""Validation images beside each other: truth, prediction, and a list of what was found (OpenCV)."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from faster_coco_eval.core import mask as rle
+from numpy.typing import NDArray
+
+from cohdc_train.data.annotations import CocoImage
+from cohdc_train.data.doctor.sample_grid import read_fitted, tint, write_outlined
+from cohdc_train.metrics.coco_metrics import Row
+from cohdc_train.metrics.matching import ImageMatch
+
+Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+_PANEL = (300, 400)  # px, height and width of truth and of prediction
+_LIST = 250  # px, width
+_LINE = 18  # px, height of a line of text
+_GAP = 6  # px
+_NUMBER = (20, 14)  # px, width and height
+_FILL = 0.35
+# BGR, of objects found as the right class; red and orange are kept for mistakes
+_COLOURS: tuple[Colour, ...] = ((75, 180, 60), (230, 160, 30), (240, 240, 70), (200, 60, 160), (90, 220, 220))
+_MISTAKE: Colour = (60, 60, 255)
+_WRONG_CLASS: Colour = (0, 150, 255)
+_CROWD: Colour = (255, 255, 255)
+_INK: Colour = (230, 230, 230)
+_PAPER = 28  # grey value of the background
+
+
+def draw_tiles(
+    title: str, matches: Sequence[ImageMatch], images: Mapping[int, CocoImage], names: Sequence[str], columns: int = 2
+) -> bytes:
+    """A JPEG of images, each with its truth on the left, its prediction in the middle and a list on the right.
+
+    An object and the detection that found it share number and colour; red: missed or false, orange: found as another
+    class, white: crowd. images: by id. Raises DataError naming an image that cannot be read.
+    """
+    tiles = [_tile(match, images[match.image_id], names) for match in matches]
+    blank = _paper(_LINE + _PANEL[0] + _GAP, 2 * _PANEL[1] + _LIST + 3 * _GAP)
+    tiles += [blank] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    legend = "left: truth, middle: predicted at class score >= 0.5; same number: found; red: missed or false"
+    head = _paper(3 * _LINE, columns * blank.shape[1])
+    for line, text in enumerate((title, legend + "; orange: other class; white: crowd; q: predicted quality")):
+        _write(head, text, (_GAP, (line + 1) * _LINE + 2), _INK, 0.5)
+    picture = np.vstack([head, *rows])
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
+
+
+class _Entry(NamedTuple):
+    """A line of the list, and what carries its number. Misses have none: they share a line per class."""
+
+    text: str
+    colour: Colour
+    object: Row | None
+    detection: Row | None
+
+
+def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
+    truth = read_fitted(image, _PANEL)
+    predicted = truth.copy()
+    entries = _entries(match, names)
+    for row in match.crowds:
+        tint(truth, _mask(row, truth), _CROWD, _FILL)
+    for missed in match.missed():
+        tint(truth, _mask(missed, truth), _MISTAKE, _FILL)
+    _draw(truth, [(entry.object, entry.colour) for entry in entries])
+    _draw(predicted, [(entry.detection, entry.colour) for entry in entries])
+    right = int(match.right.sum())
+    counts = f"objects {len(match.objects)}, found {right}, false {len(match.detections) - right}"
+    head = _paper(_LINE, 2 * _PANEL[1] + _LIST + 3 * _GAP)
+    _write(head, f"score {match.score:.2f}   {counts}   {image.path.name}", (_GAP, _LINE - 5), _INK, 0.45)
+    gap = _paper(_PANEL[0], _GAP)
+    body = np.hstack([gap, _centred(truth), gap, _centred(predicted), gap, _list(match, entries, names)])
+    return np.vstack([head, body, _paper(_GAP, body.shape[1])])
+
+
+def _draw(shown: Image, rows: Sequence[tuple[Row | None, Colour]]) -> None:
+    """Masks, then on top of them their numbers, where there is room; they count the entries from 1."""
+    masks = [None if row is None else _mask(row, shown) for row, _ in rows]
+    for mask, (_, colour) in zip(masks, rows, strict=True):
+        if mask is not None:
+            tint(shown, mask, colour, _FILL)
+    taken: list[tuple[int, int]] = []
+    for number, mask in enumerate(masks, start=1):
+        place = None if mask is None or not mask.any() else _free_place(mask, taken)
+        if place is not None:
+            taken.append(place)
+            write_outlined(shown, str(number), place, 0.5)
+
+
+def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
+    """What was found, then false detections."""
+    found: list[_Entry] = []
+    for j, (i, o) in enumerate(match.pairs()):
+        if i < 0:
+            continue
+        name = names[o["category_id"] - 1]
+        detection = match.detections[i]
+        colour = _COLOURS[len(found) % len(_COLOURS)] if match.right[j] else _WRONG_CLASS
+        seen = names[detection["category_id"] - 1]
+        what = seen if match.right[j] else f"{seen}, is {name}"
+        found.append(_Entry(f"{what} {_values(detection)} IoU {match.overlaps[i, j]:.2f}", colour, o, detection))
+    false: list[_Entry] = []
+    for i, row in enumerate(match.detections):
+        if i not in match.found:
+            overlap = match.overlaps[i].max(initial=0.0)
+            text = f"{names[row['category_id'] - 1]} {_values(row)} IoU {overlap:.2f} false"
+            false.append(_Entry(text, _MISTAKE, None, row))
+    return found + false
+
+
+def _values(row: Row) -> str:
+    return f"{row['score']:.2f} q {row['quality']:.2f}"
+
+
+def _list(match: ImageMatch, entries: Sequence[_Entry], names: Sequence[str]) -> Image:
+    shown = _paper(_PANEL[0], _LIST)
+    room = _PANEL[0] // _LINE
+    missed = Counter(names[row["category_id"] - 1] for row in match.missed())
+    lines = [(f"missed: {count} {name}", _MISTAKE) for name, count in missed.items()]
+    lines += [(f"{number} {entry.text}", entry.colour) for number, entry in enumerate(entries, start=1)]
+    if len(lines) > room:
+        lines[room - 1 :] = [(f"and {len(lines) - room + 1} more", _INK)]
+    for k, (text, colour) in enumerate(lines):
+        _write(shown, text, (0, (k + 1) * _LINE - 5), colour, 0.42)
+    return shown
+
+
+def _mask(row: Row, shown: Image) -> Image:
+    """A row's mask, [H, W] of 0 and 1, at the size at which its image is shown."""
+    decoded = rle.decode(row["segmentation"])
+    return np.asarray(cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
+    """(x, y) of a number's lower left corner: where the mask is widest, or just below or above when a number stands
+    there; None when there too."""
+    depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+    width, height = _NUMBER
+    x = min(max(int(column) - width // 2, 0), max(mask.shape[1] - width, 0))
+    for shift in (0, 1, -1):
+        y = min(max(int(row) + height // 2 + shift * height, height), mask.shape[0] - 1)
+        if not any(abs(x - left) < width and abs(y - bottom) < height for left, bottom in taken):
+            return x, y
+    return None
+
+
+def _centred(shown: Image) -> Image:
+    panel = _paper(*_PANEL)
+    top, left = ((panel.shape[k] - shown.shape[k]) // 2 for k in (0, 1))
+    panel[top : top + shown.shape[0], left : left + shown.shape[1]] = shown
+    return panel
+
+
+def _paper(height: int, width: int) -> Image:
+    return np.full((height, width, 3), _PAPER, np.uint8)
+
+
+def _write(shown: Image, text: Any, place: tuple[int, int], ink: Colour, scale: float) -> None:
+    """OpenCV has letters for ASCII only; others become question marks."""
+    plain = str(text).encode("ascii", "replace").decode()
+    cv2.putText(shown, plain, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, 1, cv2.LINE_AA)

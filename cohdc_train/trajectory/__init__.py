@@ -1,0 +1,1 @@
+"""Trajectories, their association with ground truth, and their errors."""
