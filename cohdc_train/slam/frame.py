@@ -27,7 +27,7 @@ class Pose:
         return self.T_wc is not None
 
 
-OnPose = Callable[[Pose], None]
+PoseCallback = Callable[[Pose], None]
 
 
 @dataclass(frozen=True)

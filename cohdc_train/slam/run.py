@@ -10,8 +10,8 @@ from typing import Any
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import MAX_KEYPOINTS, Culling, Method
-from cohdc_train.slam.dynamics.mask_sources import FolderMasks, ModelMasks, no_masks
-from cohdc_train.slam.frame import OnPose
+from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, no_masks
+from cohdc_train.slam.frame import PoseCallback
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.growing_sequence import Followed
@@ -19,7 +19,7 @@ from cohdc_train.slam.io.live import stopped_by_ctrl_c
 from cohdc_train.slam.io.results import check_out, measure, publish_run, write_run
 from cohdc_train.slam.io.sources import Recorded, Source, rgbd_layout
 from cohdc_train.slam.io.stereo import stereo_layout
-from cohdc_train.slam.runner import Watcher, play
+from cohdc_train.slam.runner import RunObserver, play
 from cohdc_train.slam.runtime.threads import one_thread
 from cohdc_train.slam.runtime.workers import workers
 from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
@@ -105,8 +105,8 @@ def run_source(
     cloud: bool = False,
     view: bool = False,
     rrd: Path | None = None,
-    watchers: Sequence[Watcher] = (),
-    on_pose: OnPose | None = None,
+    observers: Sequence[RunObserver] = (),
+    on_pose: PoseCallback | None = None,
     origin: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """`slam` of any source of views, a camera of one's own for instance; the same files, metrics and errors. One run at
@@ -131,13 +131,13 @@ def run_source(
             in_time = (beside.executor, beside.source.spent) if beside else ()
             tracker = Tracker(source.camera, features, seed, method, *in_time)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
-            watchers = [files, *watchers]
+            observers = [files, *observers]
             if view or rrd is not None:
-                watchers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
+                observers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
             stack.enter_context(stopped_by_ctrl_c(source))
             views, mask_of = (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
             answer = beside.answering(on_pose) if beside else on_pose
-            records = play(tracker, views, mask_of, part / "pictures", watchers, answer)
+            records = play(tracker, views, mask_of, part / "pictures", observers, answer)
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {"seed": seed, "realtime": realtime, "loops": tracker.loops, "without_depth": source.without_depth}
@@ -208,12 +208,12 @@ def _source(sequence: Path, camera: Path | None, follow: bool, idle: float) -> t
 
 def _masks(
     model: Path | None, masks: Path | None, camera: Camera, culling: Culling, threads: int
-) -> FolderMasks | ModelMasks | None:
+) -> MaskFolder | SegmenterMasks | None:
     """threads: of the segmenter, 0 = as many as there are cores."""
     if masks is not None:
-        return FolderMasks(masks, camera, culling)
+        return MaskFolder(masks, camera, culling)
     if model is None:
         return None
     from cohdc_train.segmenter import Segmenter
 
-    return ModelMasks(Segmenter(model, threads), culling)
+    return SegmenterMasks(Segmenter(model, threads), culling)

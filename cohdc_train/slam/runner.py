@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.slam.dynamics.mask_sources import MaskSource
 from cohdc_train.slam.features.keypoints import Features
-from cohdc_train.slam.features.orb import FeatureExtractor
-from cohdc_train.slam.frame import FrameRecord, OnPose, View
+from cohdc_train.slam.features.orb import OrbExtractor
+from cohdc_train.slam.frame import FrameRecord, PoseCallback, View
 from cohdc_train.slam.io.sources import Source
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.overlays import draw_after, draw_before, write_jpeg
 
 
-class Watcher(Protocol):
+class RunObserver(Protocol):
     """Sees every frame of a run: the recorder of a cloud, a viewer, a robot's own publisher."""
 
     def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
@@ -47,8 +47,8 @@ def play(
     source: Source,
     mask_of: MaskSource,
     pictures: Path,
-    watchers: Sequence[Watcher],
-    on_pose: OnPose | None = None,
+    observers: Sequence[RunObserver],
+    on_pose: PoseCallback | None = None,
 ) -> list[FrameRecord]:
     """Track every view, call on_pose as soon as its pose is known, and the watchers when all is done with it; then draw
     some into the new folder `pictures`.
@@ -65,8 +65,8 @@ def play(
             records.append(record)
             if index in chosen and tracker.features is not None:
                 drawn.append(_Picture(view, tracker.mask, tracker.features))
-            for watcher in watchers:
-                watcher(view, mask, record, tracker)
+            for observer in observers:
+                observer(view, mask, record, tracker)
             _progress(index + 1, count, record)
     except DataError as error:
         if not records or count:
@@ -80,7 +80,7 @@ def play(
     tracker.finish()
     pictures.mkdir()
     for picture in drawn:
-        _draw(picture, FeatureExtractor(tracker.camera, tracker.budget), pictures)
+        _draw(picture, OrbExtractor(tracker.camera, tracker.budget), pictures)
     return records
 
 
@@ -92,7 +92,7 @@ def _pictured(count: int) -> set[int]:
 
 
 def _step(
-    tracker: Tracker, view: View, mask_of: MaskSource, on_pose: OnPose | None
+    tracker: Tracker, view: View, mask_of: MaskSource, on_pose: PoseCallback | None
 ) -> tuple[NDArray[np.bool_] | None, FrameRecord]:
     """One frame: what a watcher gets as its mask, and what became of it."""
     start = time.perf_counter()
@@ -105,7 +105,7 @@ def _step(
     return mask, FrameRecord(view.stamp, pose, culled, segment_ms, view.depth_ms)
 
 
-def _draw(picture: _Picture, extract: FeatureExtractor, folder: Path) -> None:
+def _draw(picture: _Picture, extract: OrbExtractor, folder: Path) -> None:
     view, mask = picture.view, picture.mask
     before = draw_before(view.rgb, extract(view.rgb, view.depth), mask)
     write_jpeg(folder / f"{view.stamp}_before.jpg", before)

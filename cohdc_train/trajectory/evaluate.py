@@ -6,7 +6,7 @@ import numpy as np
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import write_json
-from cohdc_train.trajectory.association import nearest, match
+from cohdc_train.trajectory.association import match, nearest
 from cohdc_train.trajectory.metrics import Scores, all_pairs, ate, pairs_apart, rpe, statistics
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 

@@ -19,8 +19,8 @@ def hall(seed: int = 3) -> list[Rectangle]:
     for turn in np.arange(4) * np.pi / 2:
         ahead = np.array([np.sin(turn), 0.0, np.cos(turn)])
         right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
-        corner = _HALF * (ahead - right) + np.array([0.0, -1.4, 0.0])
-        walls.append(Rectangle(corner, 2 * _HALF * right, np.array([0.0, 2.8, 0.0]), texture(rng, 460, 1200, 4800)))
+        keypoint = _HALF * (ahead - right) + np.array([0.0, -1.4, 0.0])
+        walls.append(Rectangle(keypoint, 2 * _HALF * right, np.array([0.0, 2.8, 0.0]), texture(rng, 460, 1200, 4800)))
     return walls
 
 

@@ -34,8 +34,8 @@ def texture(rng: np.random.Generator, height: int, width: int, patches: int = 90
     for _ in range(patches):
         x, y = int(rng.integers(width)), int(rng.integers(height))
         w, h = (int(v) for v in rng.integers(6, 40, size=2))
-        colour = tuple(int(v) for v in rng.integers(0, 256, size=3))
-        cv2.rectangle(image, (x, y), (x + w, y + h), colour, -1)
+        color = tuple(int(v) for v in rng.integers(0, 256, size=3))
+        cv2.rectangle(image, (x, y), (x + w, y + h), color, -1)
     return cv2.GaussianBlur(image, (3, 3), 0)
 
 
@@ -84,7 +84,7 @@ def render(
     for item in rectangles:
         origin = T_cw[:3, :3] @ item.origin + T_cw[:3, 3]
         across, down = T_cw[:3, :3] @ item.across, T_cw[:3, :3] @ item.down
-        if max(corner[2] for corner in (origin, origin + across, origin + down, origin + across + down)) <= 0.1:
+        if max(keypoint[2] for keypoint in (origin, origin + across, origin + down, origin + across + down)) <= 0.1:
             continue
         normal = np.cross(across, down)
         depth = (normal @ origin) / (rays @ normal)

@@ -18,7 +18,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.files import MANIFEST, files_below
 from cohdc_train.segmenter import Detections
 from cohdc_train.slam.config import Culling, Method
-from cohdc_train.slam.dynamics.mask_sources import ModelMasks
+from cohdc_train.slam.dynamics.mask_sources import SegmenterMasks
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded
@@ -225,11 +225,11 @@ class TwoClasses:
 def test_a_model_masks_the_classes_that_are_asked_for() -> None:
     view = View(0.0, "0", "0", np.zeros((240, 320, 3), dtype=np.uint8), np.zeros((240, 320), dtype=np.float32))
     model = TwoClasses()
-    assert ModelMasks(model, Culling(dilate=0))(view).mean() == 0.5  # type: ignore[arg-type]
-    chairs = ModelMasks(model, Culling(dynamic_classes=["chair"]))  # type: ignore[arg-type]
+    assert SegmenterMasks(model, Culling(dilate=0))(view).mean() == 0.5  # type: ignore[arg-type]
+    chairs = SegmenterMasks(model, Culling(dynamic_classes=["chair"]))  # type: ignore[arg-type]
     assert not chairs(view).any()
     with pytest.raises(DataError, match="'dog' is not one of the model's: person, chair"):
-        ModelMasks(model, Culling(dynamic_classes=["dog"]))  # type: ignore[arg-type]
+        SegmenterMasks(model, Culling(dynamic_classes=["dog"]))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def test_a_doubtful_contour_grows_more_unless_its_cut_has_seen_to_that(
     cut_by_quality: bool, doubt: float | None, px: int
 ) -> None:
     view = View(0.0, "0", "0", np.zeros((240, 320, 3), dtype=np.uint8), np.zeros((240, 320), dtype=np.float32))
-    masks = ModelMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
+    masks = SegmenterMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
     assert masks(view)[120].sum() == 160 + px
     assert masks.outline(view)[1] == px
 

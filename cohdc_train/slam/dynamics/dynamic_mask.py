@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.free_space import Comparison, Geometry, Reference
+from cohdc_train.slam.dynamics.free_space import DepthComparison, FreeSpaceChecker, Reference
 from cohdc_train.slam.dynamics.masks import Mask, grow
-from cohdc_train.slam.dynamics.moving_surfaces import Movers
+from cohdc_train.slam.dynamics.moving_surfaces import MovingSurfaceTracker
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
 
@@ -15,12 +15,12 @@ _STOOD = 0.5  # s for which a surface must have stood still not to be taken for 
 _RESTED = 2.0  # s that a masked or moving thing must have stood still to be of use to tracking
 
 
-class DynamicMask:
+class DynamicMaskEstimator:
     """Makes the masks of one frame after the other."""
 
-    def __init__(self, geometry: Geometry) -> None:
+    def __init__(self, geometry: FreeSpaceChecker) -> None:
         self._geometry = geometry
-        self._movers = Movers()
+        self._movers = MovingSurfaceTracker()
 
     def forget(self) -> None:
         """The place is lost."""
@@ -39,7 +39,7 @@ class DynamicMask:
         row = {k.index: i for i, k in enumerate(all_of_them)}
         comparison = self._geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
 
-        def against(keyframes: list[Keyframe]) -> Comparison:
+        def against(keyframes: list[Keyframe]) -> DepthComparison:
             return comparison.only([row[k.index] for k in keyframes])
 
         before, long_ago = [k for k in all_of_them if k.t <= t - _STOOD], against(older)
@@ -51,7 +51,7 @@ class DynamicMask:
         if mask is None:
             return moves if moves.any() else None
         if older:
-            mask = mask & ~self._geometry.at_rest(mask, long_ago)
+            mask = mask & ~self._geometry.static_components(mask, long_ago)
         return mask | moves
 
 

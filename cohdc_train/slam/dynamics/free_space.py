@@ -27,7 +27,7 @@ _GROWTH = 3  # coarse px a mover grows over its own surface
 _JUDGED, _MOVED = 0.6, 0.05  # of a part at rest: readings that agree, at least, and that do not, at most
 
 _Value = TypeVar("_Value", bound=np.generic)
-Coarse = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
+DepthGrid = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
@@ -36,24 +36,24 @@ class Reference:
     """What a keyframe saw. T_cw: [4, 4] world to camera, m; nearest: Coarse, the least depth around every pixel."""
 
     T_cw: Array
-    nearest: Coarse
+    nearest: DepthGrid
 
 
 @dataclass(frozen=True)
-class Comparison:
+class DepthComparison:
     """A frame's depth held against k references.
 
     image: Coarse, the frame's; through: [k, h, w] bool, the reference looked through the pixel's place; agrees:
     [k, h, w] bool, it saw a surface there.
     """
 
-    image: Coarse
+    image: DepthGrid
     through: NDArray[np.bool_]
     agrees: NDArray[np.bool_]
 
-    def only(self, rows: list[int]) -> "Comparison":
+    def only(self, rows: list[int]) -> "DepthComparison":
         """The same with some of the references."""
-        return Comparison(self.image, self.through[rows], self.agrees[rows])
+        return DepthComparison(self.image, self.through[rows], self.agrees[rows])
 
     @property
     def still(self) -> NDArray[np.bool_]:
@@ -61,7 +61,7 @@ class Comparison:
         return np.asarray(self.agrees.any(axis=0) & ~self.through.any(axis=0))
 
 
-class Geometry:
+class FreeSpaceChecker:
     """The test for one camera. Depth images and masks are as measured, lens and all."""
 
     def __init__(self, camera: Camera) -> None:
@@ -81,11 +81,11 @@ class Geometry:
         flat = cv2.convertMaps(*_maps(camera.undistort(_grid(*whole)), whole), cv2.CV_16SC2, nninterpolation=True)
         self._flat = flat[0]  # where each pixel would be without distortion, whole px
 
-    def nearest(self, depth: NDArray[np.float32]) -> Coarse:
+    def nearest(self, depth: NDArray[np.float32]) -> DepthGrid:
         """What a keyframe remembers of its depth image [H, W] m: the least around every coarse pixel."""
         return np.asarray(cv2.erode(self._coarse(depth), np.ones((3, 3), np.uint8)), dtype=np.float32)
 
-    def compare(self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]) -> Comparison:
+    def compare(self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]) -> DepthComparison:
         """depth: [H, W] m, 0 = none; T_cw: [4, 4] the frame's expected pose."""
         image = self._coarse(depth)
         rows = np.flatnonzero(image)
@@ -96,9 +96,9 @@ class Geometry:
             tolerance = _NEARER + _NEARER_PER_M * z
             through[:, rows] = (seen - z > tolerance) & (z > _NEAR)
             agrees[:, rows] = (seen > 0) & (np.abs(seen - z) <= tolerance) & (z > _NEAR)
-        return Comparison(image, through.reshape(shape), agrees.reshape(shape))
+        return DepthComparison(image, through.reshape(shape), agrees.reshape(shape))
 
-    def movers(self, comparison: Comparison) -> NDArray[np.bool_]:
+    def movers(self, comparison: DepthComparison) -> NDArray[np.bool_]:
         """Returns [h, w] bool, coarse: what two references looked through, and its surface around it."""
         image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
         return _grown(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
@@ -115,7 +115,7 @@ class Geometry:
         smooth = cv2.resize(movers.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(cv2.remap(smooth, self._flat, np.empty(0), cv2.INTER_NEAREST) > 127)
 
-    def at_rest(self, mask: NDArray[np.bool_], comparison: Comparison) -> NDArray[np.bool_]:
+    def static_components(self, mask: NDArray[np.bool_], comparison: DepthComparison) -> NDArray[np.bool_]:
         """The connected parts of a mask [H, W] that lie where every reference that could see them saw a surface.
 
         Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told from rest.
@@ -130,7 +130,7 @@ class Geometry:
         rests[0] = False
         return np.asarray(rests[parts]) if rests.any() else np.zeros_like(mask)
 
-    def _coarse(self, depth: NDArray[np.float32]) -> Coarse:
+    def _coarse(self, depth: NDArray[np.float32]) -> DepthGrid:
         """The least reading of every block, 0 where less than half of it has one."""
         h, w = self._shape
         depth = depth[: h * _STEP, : w * _STEP]
@@ -174,7 +174,7 @@ def _maps(places: Array, shape: tuple[int, int]) -> tuple[NDArray[np.float32], N
     return x.reshape(shape), y.reshape(shape)
 
 
-def _grown(found: NDArray[np.bool_], still: NDArray[np.bool_], image: Coarse) -> NDArray[np.bool_]:
+def _grown(found: NDArray[np.bool_], still: NDArray[np.bool_], image: DepthGrid) -> NDArray[np.bool_]:
     """Specks dropped; the rest grown over its own surface, as far as that is not known to stand still."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
     big = stats[:, cv2.CC_STAT_AREA] >= LEAST

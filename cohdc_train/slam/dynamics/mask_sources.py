@@ -51,7 +51,7 @@ def no_masks(view: View) -> Mask | None:
     return None
 
 
-class FolderMasks:
+class MaskFolder:
     """PNGs that bear the names of the colour images; values above 0 are dynamic."""
 
     def __init__(self, folder: Path, camera: Camera, culling: Culling) -> None:
@@ -68,7 +68,7 @@ class FolderMasks:
         return read_mask(self._folder / f"{view.name}.png", self._camera), self._culling.dilate
 
 
-class ModelMasks:
+class SegmenterMasks:
     """Every frame goes through the segmenter; raises DataError for a class that the model does not know."""
 
     def __init__(self, segmenter: "Segmenter", culling: Culling) -> None:

@@ -18,7 +18,7 @@ from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.reprojection import (
     Observations,
     Prior,
-    Weighing,
+    ReprojectionModel,
     huber_weights,
     pose_jacobian,
     residual_jacobian,
@@ -38,7 +38,7 @@ def pose_of_rest(
     T_cw: Array,
     points: Array,
     seen: Observations,
-    weighing: Weighing,
+    reprojection: ReprojectionModel,
     found: NDArray[np.int64],
     prior: Prior | None = None,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
@@ -49,22 +49,22 @@ def pose_of_rest(
     Returns the pose, [m] bool inliers and [m] bool members of moving groups.
     """
     moving = np.zeros(len(points), dtype=np.bool_)
-    T_cw, inlier = optimize_pose(T_cw, points, seen, weighing, prior=prior)
+    T_cw, inlier = optimize_pose(T_cw, points, seen, reprojection, prior=prior)
     for _ in range(_ROUNDS):
         rest = np.flatnonzero(~moving)
-        group = moving_group(T_cw, points[rest], seen.take(rest), weighing, found[rest])
+        group = moving_group(T_cw, points[rest], seen.take(rest), reprojection, found[rest])
         if not group.any():
             break
         moving[rest[group]] = True
         rest = np.flatnonzero(~moving)
-        T_cw, agrees = optimize_pose(T_cw, points[rest], seen.take(rest), weighing, prior=prior)
+        T_cw, agrees = optimize_pose(T_cw, points[rest], seen.take(rest), reprojection, prior=prior)
         inlier = np.zeros(len(points), dtype=np.bool_)
         inlier[rest[agrees]] = True
     return T_cw, inlier, moving
 
 
 def moving_group(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, found: NDArray[np.int64]
+    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel, found: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """The group that most clearly moves against the rest.
 
@@ -76,8 +76,8 @@ def moving_group(
         return nothing
     local = to_local(T_cw, points)
     groups = nested_groups(local, np.minimum(found, _KNOWN))
-    error = residuals(local, seen, weighing)
-    J = pose_jacobian(local, residual_jacobian(local, seen, weighing))
+    error = residuals(local, seen, reprojection)
+    J = pose_jacobian(local, residual_jacobian(local, seen, reprojection))
     steps, covariances = _poses_without(groups, J, error, seen.limits)
     best, score = nothing, 0.0
     for row in np.flatnonzero(_may_move(groups, J, error, steps)):
@@ -119,10 +119,10 @@ def nested_groups(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 
     counts: [m] for how many each point counts when the world is sought.
     """
-    patches, centres = _patches(local)
+    patches, centers = _patches(local)
     groups = list(patches)
     if len(groups) > 1:
-        for first, second, _, _ in linkage(centres, "average"):
+        for first, second, _, _ in linkage(centers, "average"):
             groups.append(groups[int(first)] | groups[int(second)])
     members = np.stack(groups)
     size = members.sum(axis=1)

@@ -23,7 +23,7 @@ _MOST = 0.95  # of the readings: so many movers mean that the pose is wrong
 Bits = NDArray[np.bool_]  # [h, w], coarse
 
 
-class Movers:
+class MovingSurfaceTracker:
     """Remembers what moved in the latest frame."""
 
     def __init__(self) -> None:

@@ -23,15 +23,15 @@ def sample_depth(
     columns = np.clip(x + offsets[:, None], 0, width - 1)
     rows = np.clip(y + offsets[:, None], 0, height - 1)
     patch = depth.ravel().take((rows[:, None] * width + columns).reshape(-1, len(pixels)))  # [25, n]
-    centre = patch[len(patch) // 2].astype(np.float64)
+    center = patch[len(patch) // 2].astype(np.float64)
     far = patch.max(axis=0).astype(np.float64)
     near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=0).astype(np.float64)
-    refused = (centre <= 0) | (far - near > _EDGE_RELATIVE * centre)
+    refused = (center <= 0) | (far - near > _EDGE_RELATIVE * center)
     if mask is not None:
         reach = np.ones((2 * _MASK_BAND + 1, 2 * _MASK_BAND + 1), dtype=np.uint8)
         band = cv2.dilate(mask.astype(np.uint8), reach)
         refused |= band[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0
-    return np.where(refused, np.nan, centre)
+    return np.where(refused, np.nan, center)
 
 
 _MASK_BAND = 2  # px beside the mask where depth is refused

@@ -12,17 +12,17 @@ _SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
 
 
 @dataclass(frozen=True)
-class Corners:
+class Keypoints:
     """Where n corners lie in an image, and what they look like; fields as those of Features."""
 
     pixels: NDArray[np.float64]
     octaves: NDArray[np.int64]
     descriptors: NDArray[np.uint64]
-    precise: NDArray[np.bool_]
+    is_subpixel: NDArray[np.bool_]
 
-    def take(self, rows: NDArray[np.int64]) -> "Corners":
+    def take(self, rows: NDArray[np.int64]) -> "Keypoints":
         """The chosen rows."""
-        return Corners(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.precise[rows])
+        return Keypoints(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.is_subpixel[rows])
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Features:
     octaves: NDArray[np.int64]
     descriptors: NDArray[np.uint64]
     depths: NDArray[np.float64]
-    precise: NDArray[np.bool_]
+    is_subpixel: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
         n = len(self.pixels)
-        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.precise)
+        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.is_subpixel)
         shapes = tuple(array.shape for array in arrays)
         if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,), (n,)):
             raise ValueError(f"features disagree in shape: {shapes}")
@@ -51,14 +51,14 @@ class Features:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def corners(self, rows: NDArray[np.int64]) -> Corners:
+    def keypoints(self, rows: NDArray[np.int64]) -> Keypoints:
         """The chosen rows, without what camera and depth said of them."""
-        return Corners(self.pixels, self.octaves, self.descriptors, self.precise).take(rows)
+        return Keypoints(self.pixels, self.octaves, self.descriptors, self.is_subpixel).take(rows)
 
     @property
-    def for_others(self) -> "Features":
+    def without_subpixel(self) -> "Features":
         """The same corners as measurements of other points than those by whose patches they are precise."""
-        return replace(self, precise=np.zeros_like(self.precise))
+        return replace(self, is_subpixel=np.zeros_like(self.is_subpixel))
 
     @property
     def scales(self) -> NDArray[np.float64]:
@@ -68,4 +68,4 @@ class Features:
     @property
     def sigmas(self) -> NDArray[np.float64]:
         """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less where precise."""
-        return np.where(self.precise, _PRECISE, 1.0) * self.scales
+        return np.where(self.is_subpixel, _PRECISE, 1.0) * self.scales

@@ -16,14 +16,14 @@ class Matches:
     """points: [m] int64 map point ids; corners: [m] int64 rows of the frame's features. Both without repetition."""
 
     points: NDArray[np.int64]
-    corners: NDArray[np.int64]
+    keypoints: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.points)
 
     def take(self, rows: NDArray[np.bool_]) -> "Matches":
         """The chosen rows."""
-        return Matches(self.points[rows], self.corners[rows])
+        return Matches(self.points[rows], self.keypoints[rows])
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def match_projected(
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     reach = radius * np.minimum(features.scales, _WIDEST)
-    i, j = _neighbours(projected, features, float(reach.max()))
+    i, j = _neighbors(projected, features, float(reach.max()))
     x, y = projected.pixels.T.take(i, axis=1) - features.points.T.take(j, axis=1)
     near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])
     i, j = i[near], j[near]
@@ -60,19 +60,19 @@ def match_projected(
     return Matches(projected.ids[i], j)
 
 
-def _neighbours(projected: Projected, features: Features, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbors(projected: Projected, features: Features, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of a point and a corner, [k] rows of each: all within one level and `reach` px, and some further off.
 
     Corners are sorted by level and square cell of that size. The three cells side by side in which a point looks are
     then one piece of the sorted list; there are nine such pieces, of three rows on three levels.
     """
-    corner = features.points.min(axis=0) - reach
-    cells = ((features.points - corner) / reach).astype(np.int64)  # from 1 on: a rim of empty cells lies around
+    keypoint = features.points.min(axis=0) - reach
+    cells = ((features.points - keypoint) / reach).astype(np.int64)  # from 1 on: a rim of empty cells lies around
     width, height = (cells.max(axis=0) + 2).tolist()
     key = ((features.octaves + 1) * height + cells[:, 1]) * width + cells[:, 0]
     order = np.argsort(key, kind="stable")
     begins = np.r_[0, np.cumsum(np.bincount(key, minlength=(LEVELS + 2) * height * width))]
-    places = np.floor((projected.pixels - corner) / reach).astype(np.int64)
+    places = np.floor((projected.pixels - keypoint) / reach).astype(np.int64)
     x, y = np.clip(places, 0, (width - 1, height - 1)).T
     beside = np.arange(-1, 2)[:, None]
     levels = projected.levels + 1 + beside[:, None]

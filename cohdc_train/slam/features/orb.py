@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.config import MAX_KEYPOINTS
 from cohdc_train.slam.features.depth_sampling import sample_depth
-from cohdc_train.slam.features.keypoints import _SCALES, LEVELS, SCALE, Corners, Features
+from cohdc_train.slam.features.keypoints import _SCALES, LEVELS, SCALE, Features, Keypoints
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import inverse, to_local
 
@@ -19,7 +19,7 @@ _ENOUGH = 1.6  # the same, below which the next threshold is tried
 _THRESHOLDS = (40, 20, 12, 7)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
 
 
-class FeatureExtractor:
+class OrbExtractor:
     """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a crowd costs none."""
 
     def __init__(self, camera: Camera, budget: int = MAX_KEYPOINTS) -> None:
@@ -43,7 +43,7 @@ class FeatureExtractor:
         """
         return self.measure(self.find(rgb, mask), depth, mask, lag)
 
-    def find(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Corners:
+    def find(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Keypoints:
         """The corners alone; arguments as above."""
         gray = gray_of(rgb)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
@@ -54,27 +54,27 @@ class FeatureExtractor:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
         pixels += 0.5 * (_SCALES[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
-        return Corners(pixels, octaves, np.ascontiguousarray(words).view(np.uint64), np.zeros(len(pixels), np.bool_))
+        return Keypoints(pixels, octaves, np.ascontiguousarray(words).view(np.uint64), np.zeros(len(pixels), np.bool_))
 
     def measure(
         self,
-        corners: Corners,
+        keypoints: Keypoints,
         depth: NDArray[np.float32],
         mask: NDArray[np.bool_] | None = None,
         lag: NDArray[np.float64] | None = None,
     ) -> Features:
         """What camera and depth image say of corners; arguments as above."""
-        pixels = corners.pixels
+        pixels = keypoints.pixels
         points = self.camera.undistort(pixels)
         depths = sample_depth(depth, pixels, mask)
         if lag is not None:
             depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
-        return Features(pixels, points, corners.octaves, corners.descriptors, depths, corners.precise)
+        return Features(pixels, points, keypoints.octaves, keypoints.descriptors, depths, keypoints.is_subpixel)
 
     def _caught_up(
         self,
         depth: NDArray[np.float32],
-        corners: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+        keypoints: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
         mask: NDArray[np.bool_] | None,
         lag: NDArray[np.float64],
     ) -> NDArray[np.float64]:
@@ -82,7 +82,7 @@ class FeatureExtractor:
 
         A hand moves a Kinect by half a centimetre in the 17 ms that its two images lie apart.
         """
-        pixels, points, depths = corners
+        pixels, points, depths = keypoints
         there = self.camera.project(to_local(lag, self.camera.backproject(points, depths)))
         shift = np.nan_to_num(there - points)
         moved = sample_depth(depth, pixels + shift, mask)
@@ -116,10 +116,10 @@ def gray_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def _places(corners: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _places(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """[n, 2] px and [n] pyramid levels."""
-    pixels = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64).reshape(-1, 2)
-    return pixels, np.fromiter(map(attrgetter("octave"), corners), np.int64, len(corners))
+    pixels = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64).reshape(-1, 2)
+    return pixels, np.fromiter(map(attrgetter("octave"), keypoints), np.int64, len(keypoints))
 
 
 def _orb(count: int, threshold: int) -> cv2.ORB:

@@ -80,10 +80,10 @@ def align(
     or does not look alike.
     """
     n = len(pixels)
-    inner = _centred(template[:, 1:-1, 1:-1])
+    inner = _centered(template[:, 1:-1, 1:-1])
     contrast = np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-6)
-    dx = _centred(0.5 * (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]))
-    dy = _centred(0.5 * (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]))
+    dx = _centered(0.5 * (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]))
+    dy = _centered(0.5 * (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]))
     gradient = np.stack([dx, dy], axis=1)  # [n, 2, k]
     H = (gradient @ gradient.transpose(0, 2, 1)).astype(np.float64) + 1e-3 * np.eye(2)
     active = _least_eigenvalue(H) > _TEXTURE
@@ -93,7 +93,7 @@ def align(
         rows = np.flatnonzero(active)
         if len(rows) == 0:
             break
-        seen = _centred(pyramid.cut(pixels[rows], octaves[rows], side, shift[rows]))
+        seen = _centered(pyramid.cut(pixels[rows], octaves[rows], side, shift[rows]))
         wanted = inner[rows]
         seen *= contrast[rows] / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-6)
         likeness[rows] = np.einsum("nk,nk->n", seen, wanted) / contrast[rows, 0] ** 2
@@ -109,7 +109,7 @@ def _least_eigenvalue(H: Array) -> Array:
     return np.asarray(mean - np.hypot(half, H[:, 0, 1]))
 
 
-def _centred(patches: Floats) -> Floats:
+def _centered(patches: Floats) -> Floats:
     """[n, k]: every patch without its mean."""
     flat = patches.reshape(len(patches), -1)
     return np.asarray(flat - flat.mean(axis=1, keepdims=True), dtype=np.float32)

@@ -9,7 +9,7 @@ from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array
 
 
-def unrolled(features: Features, camera: Camera, twist: Array) -> Features:
+def undo_rolling_shutter(features: Features, camera: Camera, twist: Array) -> Features:
     """The corners as a camera would have measured them that takes all rows at once, halfway through the readout.
 
     twist: [6] velocity of the world in the camera's frame, (m/s, rad/s), a point moves by v + omega x X. Corners

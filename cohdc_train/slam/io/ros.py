@@ -14,7 +14,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array
 
-_COLOURS: dict[str, tuple[int, int | None]] = {  # encoding: channels, and OpenCV's way to RGB
+_COLORS: dict[str, tuple[int, int | None]] = {  # encoding: channels, and OpenCV's way to RGB
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
@@ -45,9 +45,9 @@ def camera_of(info: Any) -> Camera:
 
 def rgb_of(image: Any) -> NDArray[np.uint8]:
     """sensor_msgs/Image to [H, W, 3] uint8 RGB. Raises DataError unless it is rgb8, bgr8, rgba8, bgra8 or mono8."""
-    if image.encoding not in _COLOURS:
-        raise DataError(f"colour image: encoding {image.encoding!r} is not one of {' '.join(_COLOURS)}")
-    channels, code = _COLOURS[image.encoding]
+    if image.encoding not in _COLORS:
+        raise DataError(f"colour image: encoding {image.encoding!r} is not one of {' '.join(_COLORS)}")
+    channels, code = _COLORS[image.encoding]
     pixels = _pixels(image, np.dtype("u1"), channels)
     return pixels.copy() if code is None else np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
 
@@ -58,8 +58,8 @@ def depth_of(image: Any) -> NDArray[np.float32]:
         raise DataError(f"depth image: encoding {image.encoding!r} is not one of {' '.join(_DEPTHS)}")
     kind, scale = _DEPTHS[image.encoding]
     order = ">" if image.is_bigendian else "<"
-    metres = _pixels(image, np.dtype(order + kind), 1).astype(np.float32) / np.float32(scale)
-    return np.where(np.isfinite(metres), metres, 0).astype(np.float32)
+    meters = _pixels(image, np.dtype(order + kind), 1).astype(np.float32) / np.float32(scale)
+    return np.where(np.isfinite(meters), meters, 0).astype(np.float32)
 
 
 def _pixels(image: Any, kind: np.dtype[Any], channels: int) -> NDArray[Any]:

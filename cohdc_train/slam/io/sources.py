@@ -46,9 +46,9 @@ class Layout:
 def rgbd_layout(camera: Camera) -> Layout:
     """TUM's layout: rgb.txt and depth.txt."""
 
-    def view(colour: Entry, depth: Entry) -> View:
-        rgb, metres = read_rgb(colour.image, camera), read_depth(depth.image, camera)
-        return View(colour.t, colour.stamp, colour.image.stem, rgb, metres, depth.t)
+    def view(color: Entry, depth: Entry) -> View:
+        rgb, meters = read_rgb(color.image, camera), read_depth(depth.image, camera)
+        return View(color.t, color.stamp, color.image.stem, rgb, meters, depth.t)
 
     return Layout("rgb.txt", "depth.txt", 0.02, view)
 

@@ -4,16 +4,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from cohdc_train.slam.geometry.depth_image import Picture
+from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.geometry.se3 import inverse
-from cohdc_train.slam.loop_closing.place_recognition import Places
-from cohdc_train.slam.loop_closing.verification import Loop, Verifier
+from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognition
+from cohdc_train.slam.loop_closing.verification import Loop, LoopVerifier
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.map_points import fuse_into
 from cohdc_train.slam.optimization.pose_graph import Edges, optimize_graph
-from cohdc_train.slam.optimization.reprojection import Weighing
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
 _RECENT = 10  # keyframes that cannot be a loop with the newest
 _COVISIBLE = 15  # shared points make neighbours, and neighbours are no loop
@@ -30,15 +30,15 @@ _TRUST = 0.3  # weight that the graph must leave to a new loop
 class LoopCloser:
     """Watches the keyframes of a map; `closed` counts the loops closed."""
 
-    def __init__(self, world: Map, weighing: Weighing, seed: int = 0) -> None:
+    def __init__(self, world: Map, reprojection: ReprojectionModel, seed: int = 0) -> None:
         self.closed = 0
-        self._world, self._weighing = world, weighing
-        self._places = Places(seed)
-        self._pictures: dict[int, Picture] = {}  # of the keyframes in the map, by index
+        self._world, self._reprojection = world, reprojection
+        self._places = PlaceRecognition(seed)
+        self._pictures: dict[int, DepthImage] = {}  # of the keyframes in the map, by index
         self._loops: list[Loop] = []
-        self._verify = Verifier(world, weighing, np.random.default_rng(seed))
+        self._verify = LoopVerifier(world, reprojection, np.random.default_rng(seed))
 
-    def close(self, keyframe: Keyframe, picture: Picture) -> bool:
+    def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
         """Look for a loop with the newest keyframe of the map; every one must be given once, when it has joined.
 
         Where one is found, all poses and points of the map move; returns whether that happened.
@@ -118,7 +118,7 @@ class LoopCloser:
         place = world.covisible(world.anchor(loop.old)[0].seen_points(), _FUSE)
         for here in world.covisible(keyframe.seen_points(), _FUSE):
             fuse_into(world, world.points_of(place), here, world.keyframes)
-        adjust_window(world, keyframe, self._weighing)
+        adjust_window(world, keyframe, self._reprojection)
 
 
 def _shared_points(world: Map) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ _TABLES = 8
 _BITS = 16  # of 256, drawn per table: two descriptors meet in a table when all these agree
 
 
-class Places:
+class PlaceRecognition:
     """An index over keyframes by locality-sensitive hashing.
 
     Each table hashes a descriptor by its own random bits. A hash that few keyframes hold says much, one that many hold

@@ -13,15 +13,15 @@ from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, Window, close_window, open_window, solve
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.reprojection import Weighing
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
 
 class BackgroundMapper:
     """Bundle adjustments, one after the other, in an executor."""
 
-    def __init__(self, executor: Executor, weighing: Weighing) -> None:
+    def __init__(self, executor: Executor, reprojection: ReprojectionModel) -> None:
         self._executor = executor
-        self._weighing = weighing
+        self._reprojection = reprojection
         self._running: tuple[Window, Future[Solution]] | None = None
         self._waiting: Keyframe | None = None
 
@@ -38,7 +38,7 @@ class BackgroundMapper:
             return
         window = open_window(world, keyframe)
         poses = np.stack(window.poses)
-        job = self._executor.submit(solve, poses, window.points, window.problem, self._weighing)
+        job = self._executor.submit(solve, poses, window.points, window.problem, self._reprojection)
         self._running = window, job
 
     def collect(self, world: Map) -> Array | None:

@@ -22,7 +22,7 @@ class _Logged(NamedTuple):
     pull: Array
 
 
-class FrameLog:
+class FrameHistory:
     """The frames of one run, in their order."""
 
     def __init__(self) -> None:
@@ -43,8 +43,10 @@ class FrameLog:
         return np.array([frame.t for frame in self._frames])
 
     def poses(self, world: Map) -> Array:
-        """[n, 4, 4] T_cw world to camera, m: each frame re-derived from its reference keyframe, or that one's heir, as
-        the map has it now."""
+        """Return poses [n, 4, 4] T_cw world to camera, m, as the map has them now.
+
+        Each frame is re-derived from its reference keyframe, or from that one's successor.
+        """
         references = [frame.reference for frame in self._frames]
         keyframes = {index: world.pose(index) for index in set(references)}
         poses = [frame.relative @ keyframes[frame.reference] for frame in self._frames]

@@ -14,11 +14,11 @@ from cohdc_train.slam.config import FEW
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.geometry.se3 import Array
-from cohdc_train.slam.mapping.frame_history import FrameLog
+from cohdc_train.slam.mapping.frame_history import FrameHistory
 from cohdc_train.slam.mapping.keyframe import observations
 from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, close_window, select_window, solve
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.reprojection import Observations, Weighing
+from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel
 
 _MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
 _TURNS = 2  # a matched frame gives only every second of its points, another one the others: a quarter of the time
@@ -30,11 +30,11 @@ class _Kept(NamedTuple):
 
     row: int
     ids: NDArray[np.int64]
-    born: NDArray[np.int64]
+    first_keyframe: NDArray[np.int64]
     seen: Observations
 
 
-class SeenFrames:
+class ObservedFrames:
     """Frames by what they saw of the map, evenly thinned: so many are kept that memory is bounded."""
 
     def __init__(self) -> None:
@@ -59,41 +59,41 @@ class SeenFrames:
 
     def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
         """What was chosen of the frame in a row of the log, after those before it, and its corners."""
-        ids, seen = matches.points, observations(features, matches.corners)
-        self._kept.append(_Kept(row, ids, world.born[ids], seen))
+        ids, seen = matches.points, observations(features, matches.keypoints)
+        self._kept.append(_Kept(row, ids, world.first_keyframe[ids], seen))
         if len(self._kept) > _MOST:
             self._kept = self._kept[::2]
             self._every *= 2
 
-    def adjust(self, world: Map, weighing: Weighing, log: FrameLog) -> None:
+    def adjust(self, world: Map, reprojection: ReprojectionModel, log: FrameHistory) -> None:
         """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are moved in the log;
         others stay where they lie from their reference keyframes.
 
         Without the first step a map that loops have moved is still too far off when the few of the second are over.
         """
-        adjust_everything(world, weighing)
+        adjust_everything(world, reprojection)
         stamps, keyframes = log.stamps, {keyframe.t for keyframe in world.keyframes}
         others = [kept for kept in self._kept if stamps[kept.row] not in keyframes]
         if not others:
             return
         poses = log.poses(world)
         sightings = [_sighting(kept, poses[kept.row], world) for kept in others]
-        log.put(world, [kept.row for kept in others], adjust_everything(world, weighing, sightings))
+        log.put(world, [kept.row for kept in others], adjust_everything(world, reprojection, sightings))
 
 
 def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
     """What a frame saw of points that are still there."""
-    same = np.flatnonzero(world.born[kept.ids] == kept.born)
+    same = np.flatnonzero(world.first_keyframe[kept.ids] == kept.first_keyframe)
     ids = world.current(kept.ids[same])
-    there = np.flatnonzero(world.seen_by[ids] > 0)
+    there = np.flatnonzero(world.num_observations[ids] > 0)
     ids, first = np.unique(ids[there], return_index=True)
     return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))
 
 
-def adjust_everything(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> Array:
+def adjust_everything(world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()) -> Array:
     """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first keyframe holds
     still. Returns [s, 4, 4] T_cw of those frames, m."""
     window = select_window(world, list(world.keyframes), 1, sightings)
-    solution = solve(np.stack(window.poses), window.points, window.problem, weighing)
+    solution = solve(np.stack(window.poses), window.points, window.problem, reprojection)
     close_window(world, window, solution)
     return solution.poses[len(window.keyframes) :]

@@ -31,12 +31,12 @@ class Keyframe:
         """Ids of the points this keyframe sees."""
         return self.point_ids[self.point_ids >= 0]
 
-    def centre(self) -> Array:
+    def center(self) -> Array:
         """[3] position of the camera in the world, m."""
         return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
 
 
-def observations(features: Features, corners: NDArray[np.int64]) -> Observations:
+def observations(features: Features, keypoints: NDArray[np.int64]) -> Observations:
     """What a frame measured at some of its corners."""
-    sigmas, depth_sigmas = features.sigmas[corners], features.scales[corners]
-    return Observations(features.points[corners], features.depths[corners], sigmas, depth_sigmas)
+    sigmas, depth_sigmas = features.sigmas[keypoints], features.scales[keypoints]
+    return Observations(features.points[keypoints], features.depths[keypoints], sigmas, depth_sigmas)

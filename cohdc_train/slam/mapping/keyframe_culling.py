@@ -44,13 +44,13 @@ def _levels(ids: NDArray[np.int64], keyframes: list[Keyframe], size: int) -> NDA
     column[ids] = np.arange(len(ids))
     levels = np.full((len(keyframes), len(ids)), 2 * LEVELS, dtype=np.int8)
     for row, keyframe in zip(levels, keyframes, strict=True):
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
-        row[column[keyframe.point_ids[corners]]] = keyframe.features.octaves[corners]
+        keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+        row[column[keyframe.point_ids[keypoints]]] = keyframe.features.octaves[keypoints]
     return levels
 
 
 def _remove(world: Map, keyframe: Keyframe) -> None:
     points = keyframe.seen_points()
-    heir = next((k for k in world.covisible(points, 2) if k is not keyframe), world.keyframes[0])
-    world.remove_keyframe(keyframe, heir)
-    drop_points(world, points[world.seen_by[points] < MIN_SEEN_BY])
+    successor = next((k for k in world.covisible(points, 2) if k is not keyframe), world.keyframes[0])
+    world.remove_keyframe(keyframe, successor)
+    drop_points(world, points[world.num_observations[points] < MIN_SEEN_BY])

@@ -13,7 +13,7 @@ from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, measurement_chi2
-from cohdc_train.slam.optimization.reprojection import Observations, Weighing, joined
+from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel, joined
 
 WINDOW = 12  # keyframes in local bundle adjustment
 FIXED = 3  # of them hold still and carry the frame of reference
@@ -33,7 +33,7 @@ class Window:
     ids: NDArray[np.int64]
     points: Array
     problem: Problem
-    corners: NDArray[np.int64]
+    keypoints: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -68,27 +68,27 @@ def select_window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: 
     row = np.full(world.size + 1, -1)
     row[ids] = np.arange(len(ids))
     named = [k.point_ids for k in keyframes] + [s.ids for s in sightings]
-    corners = [np.flatnonzero(row[points] >= 0) for points in named]
-    points = [row[all_of_them[c]] for all_of_them, c in zip(named, corners, strict=True)]
-    seen = [observations(k.features, c) for k, c in zip(keyframes, corners, strict=False)]
-    seen += [s.seen.take(c) for s, c in zip(sightings, corners[len(keyframes) :], strict=True)]
+    keypoints = [np.flatnonzero(row[points] >= 0) for points in named]
+    points = [row[all_of_them[c]] for all_of_them, c in zip(named, keypoints, strict=True)]
+    seen = [observations(k.features, c) for k, c in zip(keyframes, keypoints, strict=False)]
+    seen += [s.seen.take(c) for s, c in zip(sightings, keypoints[len(keyframes) :], strict=True)]
     rows = np.concatenate(points)
     problem = Problem(
-        cameras=np.repeat(np.arange(len(corners)), [len(c) for c in corners]),
+        cameras=np.repeat(np.arange(len(keypoints)), [len(c) for c in keypoints]),
         points=rows,
         seen=joined(seen).trusted(world.trust(ids)[rows]),
-        free=np.arange(len(corners)) >= fixed,
+        free=np.arange(len(keypoints)) >= fixed,
     )
     poses = [k.T_cw for k in keyframes] + [s.T_cw for s in sightings]
-    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(corners))
+    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(keypoints))
 
 
-def solve(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Solution:
+def solve(poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel) -> Solution:
     """Robustly first, then once more without the measurements that do not fit. Arrays as in `Window`."""
-    poses, points = adjust(poses, points, problem, weighing, steps=5)
-    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
-    poses, points = adjust(poses, points, problem.take(good), weighing, steps=3, robust=False)
-    good = measurement_chi2(poses, points, problem, weighing) <= problem.seen.limits
+    poses, points = adjust(poses, points, problem, reprojection, steps=5)
+    good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
+    poses, points = adjust(poses, points, problem.take(good), reprojection, steps=3, robust=False)
+    good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
     return Solution(poses, points, good)
 
 
@@ -108,19 +108,19 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
     for keyframe in world.keyframes:
         if keyframe.index > newest:
             keyframe.T_cw = keyframe.T_cw @ motion
-    added = np.flatnonzero(world.born[: world.size] > newest)
+    added = np.flatnonzero(world.first_keyframe[: world.size] > newest)
     world.positions[added] = to_local(inverse(motion), world.positions[added])
-    same = world.born[window.ids] <= newest  # a younger point may have taken the row of one that is gone
+    same = world.first_keyframe[window.ids] <= newest  # a younger point may have taken the row of one that is gone
     world.positions[window.ids[same]] = solution.points[same]
     for slot, member in enumerate(window.keyframes):
         member.T_cw = solution.poses[slot]
         rows = (window.problem.cameras == slot) & ~solution.good
-        corners, ids = window.corners[rows], window.ids[window.problem.points[rows]]
-        world.forget(member, corners[member.point_ids[corners] == ids])
+        keypoints, ids = window.keypoints[rows], window.ids[window.problem.points[rows]]
+        world.forget(member, keypoints[member.point_ids[keypoints] == ids])
     return motion
 
 
-def adjust_window(world: Map, keyframe: Keyframe, weighing: Weighing) -> None:
+def adjust_window(world: Map, keyframe: Keyframe, reprojection: ReprojectionModel) -> None:
     """Bundle-adjust the newest keyframe with those that share most points; measurements that do not fit are dropped."""
     window = open_window(world, keyframe)
-    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, weighing))
+    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, reprojection))

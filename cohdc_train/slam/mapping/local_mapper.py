@@ -6,15 +6,15 @@ from concurrent.futures import Executor
 from typing import Protocol
 
 from cohdc_train.slam.config import Method
-from cohdc_train.slam.geometry.depth_image import Picture
+from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.mapping.background_bundle_adjustment import BackgroundMapper
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
 from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.map_points import add_points, cull, fuse
-from cohdc_train.slam.mapping.patch_refiner import Refiner
-from cohdc_train.slam.optimization.reprojection import Weighing
+from cohdc_train.slam.mapping.patch_refiner import PatchRefiner
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
 
 class LoopCloserLike(Protocol):
@@ -26,14 +26,14 @@ class LoopCloserLike(Protocol):
     def ends(self) -> set[int]:
         """Indices of the keyframes that loops refer to."""
 
-    def close(self, keyframe: Keyframe, picture: Picture) -> bool:
+    def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
         """Look for a loop with the newest keyframe. Returns whether the map moved."""
 
     def forget(self, keyframe: Keyframe) -> None:
         """Forget a keyframe that the map gave up."""
 
 
-class LocalMapping:
+class LocalMapper:
     """Takes keyframes into a map and puts it in order.
 
     refiner: cuts out the patches of new points; loop_closer: closes loops with every keyframe, None closes none;
@@ -44,15 +44,15 @@ class LocalMapping:
     def __init__(
         self,
         world: Map,
-        weighing: Weighing,
+        reprojection: ReprojectionModel,
         method: Method,
-        refiner: Refiner | None,
+        refiner: PatchRefiner | None,
         loop_closer: LoopCloserLike | None,
         executor: Executor | None,
         in_parts: bool,
     ) -> None:
-        self._world, self._weighing = world, weighing
-        self._mapper = None if executor is None else BackgroundMapper(executor, weighing)
+        self._world, self._reprojection = world, reprojection
+        self._mapper = None if executor is None else BackgroundMapper(executor, reprojection)
         self._refiner = refiner
         self._loops = loop_closer
         self._culls_keyframes = method.keyframe_culling
@@ -69,7 +69,7 @@ class LocalMapping:
         """Whether something is left to do of the latest keyframe."""
         return bool(self._parts)
 
-    def insert(self, keyframe: Keyframe, picture: Callable[[], Picture]) -> None:
+    def insert(self, keyframe: Keyframe, picture: Callable[[], DepthImage]) -> None:
         """A tracked keyframe joins, and its corners of known depth become points. Then: duplicates merged, bundle
         adjustment, weak points out; loops, superfluous keyframes out.
 
@@ -109,12 +109,12 @@ class LocalMapping:
             return
         fuse(self._world, keyframe)
         if self._mapper is None:
-            adjust_window(self._world, keyframe, self._weighing)
+            adjust_window(self._world, keyframe, self._reprojection)
         else:
             self._mapper.start(self._world, keyframe)
         cull(self._world, keyframe.index)
 
-    def _look_back(self, keyframe: Keyframe, picture: Callable[[], Picture]) -> None:
+    def _look_back(self, keyframe: Keyframe, picture: Callable[[], DepthImage]) -> None:
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
         if self._loops is not None:
             self._loops.close(keyframe, picture())

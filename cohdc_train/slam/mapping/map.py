@@ -12,7 +12,7 @@ from cohdc_train.slam.optimization.reprojection import Observations
 
 _NEAR = 0.1  # m
 _OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
-_NEIGHBOURS = 64  # keyframes that are looked at when those that share most points are sought
+_NEIGHBORS = 64  # keyframes that are looked at when those that share most points are sought
 _STILL = 3.0  # log-odds that a new point stands still
 _WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
 _VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
@@ -30,16 +30,16 @@ class Map:
         self.keyframes: list[Keyframe] = []
         self.joined = 0
         self._by_index: dict[int, Keyframe] = {}
-        self._heirs: dict[int, tuple[int, Array]] = {}  # of removed keyframes: whom each hangs on, and by what
+        self._successors: dict[int, tuple[int, Array]] = {}  # of removed keyframes: whom each hangs on, and by what
         self.size = 0
         self.positions = np.zeros((1024, 3))
         self.descriptors = np.zeros((1024, 4), dtype=np.uint64)
         self.directions = np.zeros((1024, 3))  # sum of unit vectors from camera centres to the point
         self.reach = np.zeros(1024)  # m: from further away not even the finest level shows the point
-        self.seen_by = np.zeros(1024, dtype=np.int64)  # keyframes
+        self.num_observations = np.zeros(1024, dtype=np.int64)  # keyframes
         self.observers = np.zeros((1024, _OBSERVERS), dtype=np.int32)  # keyframe index + 1, 0 = none, in any order
-        self.born = np.zeros(1024, dtype=np.int64)  # keyframe index
-        self.became = np.full(1024, -1)  # the point that took over the one in this row
+        self.first_keyframe = np.zeros(1024, dtype=np.int64)  # keyframe index
+        self.merged_into = np.full(1024, -1)  # the point that took over the one in this row
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
         self.found = np.zeros(1024, dtype=np.int64)  # frames that did
         self.moved = np.zeros(1024)  # log-odds against standing still, beyond those of a new point
@@ -51,7 +51,7 @@ class Map:
         self.joined = keyframe.index + 1
         self._add_observer(keyframe.seen_points(), keyframe)
 
-    def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:
+    def remove_keyframe(self, keyframe: Keyframe, successor: Keyframe) -> None:
         """Take out a keyframe; what hung on it, frames and points, hangs on another from now on, where it is now.
 
         The directions its points were seen from stay known.
@@ -59,14 +59,16 @@ class Map:
         self.forget(keyframe, np.flatnonzero(keyframe.point_ids >= 0))
         self.keyframes.remove(keyframe)
         del self._by_index[keyframe.index]
-        self._heirs[keyframe.index] = heir.index, keyframe.T_cw @ inverse(heir.T_cw)
+        self._successors[keyframe.index] = successor.index, keyframe.T_cw @ inverse(successor.T_cw)
 
     def anchor(self, index: int) -> tuple[Keyframe, Array]:
-        """What a keyframe that joined once hangs on: itself, or the heir of a removed one; and [4, 4] from the heir's
-        camera to its own, m."""
+        """Return the keyframe that another one is relative to, and [4, 4] from its camera to the other's, m.
+
+        It is the keyframe itself while it is in the map, and else its successor.
+        """
         T = np.eye(4)
         while index not in self._by_index:
-            index, step = self._heirs[index]
+            index, step = self._successors[index]
             T = T @ step
         return self._by_index[index], T
 
@@ -79,33 +81,33 @@ class Map:
         """[joined, 4, 4] T_wc, m, of all keyframes, removed ones too."""
         return inverse(np.stack([self.pose(index) for index in range(self.joined)]))
 
-    def add_points(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
+    def add_points(self, keyframe: Keyframe, keypoints: NDArray[np.int64]) -> None:
         """New points at the depth that was measured at corners of a keyframe."""
-        features, count = keyframe.features, len(corners)
+        features, count = keyframe.features, len(keypoints)
         ids = self._free_rows(count)
-        local = self.camera.backproject(features.points[corners], features.depths[corners])
+        local = self.camera.backproject(features.points[keypoints], features.depths[keypoints])
         self.positions[ids] = (local - keyframe.T_cw[:3, 3]) @ keyframe.T_cw[:3, :3]
-        self.descriptors[ids] = features.descriptors[corners]
-        self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[corners]
-        self.born[ids] = keyframe.index
-        self.became[ids] = -1
+        self.descriptors[ids] = features.descriptors[keypoints]
+        self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[keypoints]
+        self.first_keyframe[ids] = keyframe.index
+        self.merged_into[ids] = -1
         self.directions[ids] = 0.0
         self.moved[ids] = 0.0
         self.visible[ids] = self.found[ids] = 1
-        self.observe(keyframe, Matches(ids, corners))
+        self.observe(keyframe, Matches(ids, keypoints))
 
     def observe(self, keyframe: Keyframe, matches: Matches) -> None:
         """Corners of a keyframe, free so far, are measurements of points, held against none of their patches."""
-        keyframe.point_ids[matches.corners] = matches.points
-        keyframe.features.precise[matches.corners] = False
+        keyframe.point_ids[matches.keypoints] = matches.points
+        keyframe.features.is_subpixel[matches.keypoints] = False
         self._add_observer(matches.points, keyframe)
 
-    def forget(self, keyframe: Keyframe, corners: NDArray[np.int64]) -> None:
+    def forget(self, keyframe: Keyframe, keypoints: NDArray[np.int64]) -> None:
         """Corners of a keyframe are no measurements of their points."""
-        ids = keyframe.point_ids[corners]
-        np.subtract.at(self.seen_by, ids, 1)
+        ids = keyframe.point_ids[keypoints]
+        np.subtract.at(self.num_observations, ids, 1)
         self.observers[ids] = np.where(self.observers[ids] == keyframe.index + 1, 0, self.observers[ids])
-        keyframe.point_ids[corners] = -1
+        keyframe.point_ids[keypoints] = -1
 
     def replace(self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
         """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point.
@@ -114,7 +116,7 @@ class Map:
         would count what a group did twice.
         """
         np.maximum.at(self.moved, new, self.moved[old])
-        self.became[old] = new
+        self.merged_into[old] = new
         alias = np.arange(self.size + 1)
         alias[old] = new
         alias[-1] = -1
@@ -124,21 +126,22 @@ class Map:
             if len(changed) == 0:
                 continue
             self.forget(keyframe, changed)
-            heirs = ids[changed]
-            corner = np.full(self.size + 1, -1)  # that an heir gets, the first of several
-            corner[heirs[::-1]] = changed[::-1]
-            corner[keyframe.point_ids] = -1  # it has one
-            keep = corner[heirs] == changed
-            self.observe(keyframe, Matches(heirs[keep], changed[keep]))
+            successors = ids[changed]
+            keypoint = np.full(self.size + 1, -1)  # that an successor gets, the first of several
+            keypoint[successors[::-1]] = changed[::-1]
+            keypoint[keyframe.point_ids] = -1  # it has one
+            keep = keypoint[successors] == changed
+            self.observe(keyframe, Matches(successors[keep], changed[keep]))
 
     def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """[n] what the points `ids` have become, by however many steps: themselves where none took them over."""
         while True:
-            heirs = self.became[ids]
-            taken = (heirs >= 0) & (self.born[heirs] <= self.born[ids])  # else a new point has the heir's row
+            successors = self.merged_into[ids]
+            # Where the successor's row holds a younger point, the successor is gone.
+            taken = (successors >= 0) & (self.first_keyframe[successors] <= self.first_keyframe[ids])
             if not taken.any():
                 return ids
-            ids = np.where(taken, heirs, ids)
+            ids = np.where(taken, successors, ids)
 
     def trust(self, ids: NDArray[np.int64]) -> Array:
         """[n] probability that each point stands still, as a share of a new point's: its weight, above 0 up to 1."""
@@ -146,10 +149,10 @@ class Map:
 
     def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
         """Where the map has the matched points, [m, 3] m, and what a frame measured of them."""
-        seen = observations(features, matches.corners).trusted(self.trust(matches.points))
+        seen = observations(features, matches.keypoints).trusted(self.trust(matches.points))
         return self.positions[matches.points], seen
 
-    def judge(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
+    def update_static_odds(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
         """A frame has seen points stand still, and others move with a group that does not."""
         self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)
         self.moved[moving] = np.minimum(self.moved[moving] + _WENT, _CERTAIN)
@@ -167,7 +170,7 @@ class Map:
         does not grow with the map.
         """
         often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
-        near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBOURS])
+        near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBORS])
         keyframes = [self._by_index[i] for i in near.tolist() if often[i] > 0]
         shared = self.shared(ids, keyframes)
         order = np.argsort(-shared, kind="stable")[:limit]
@@ -178,7 +181,7 @@ class Map:
 
         A point remembers a few of its observers; where it has more, all keyframes are returned.
         """
-        if (self.seen_by[ids] > _OBSERVERS).any():
+        if (self.num_observations[ids] > _OBSERVERS).any():
             return list(self.keyframes)
         return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
 
@@ -186,8 +189,8 @@ class Map:
         """Keyframes go to poses [keyframes, 4, 4] T_cw, m, and every point goes along with the one it was born in."""
         motions = inverse(poses) @ np.stack([k.T_cw for k in self.keyframes])
         row = {keyframe.index: i for i, keyframe in enumerate(self.keyframes)}
-        born, which = np.unique(self.born[: self.size], return_inverse=True)
-        motion = motions[[row[self.anchor(index)[0].index] for index in born.tolist()]][which]
+        first_keyframe, which = np.unique(self.first_keyframe[: self.size], return_inverse=True)
+        motion = motions[[row[self.anchor(index)[0].index] for index in first_keyframe.tolist()]][which]
         for keyframe, T_cw in zip(self.keyframes, poses, strict=True):
             keyframe.T_cw = T_cw
         moved = np.einsum("nij,nj->ni", motion[:, :3, :3], self.positions[: self.size])
@@ -227,13 +230,13 @@ class Map:
 
     def _add_observer(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
         self.observers[ids, self.observers[ids].argmin(axis=1)] = keyframe.index + 1  # a free place, or the oldest's
-        self.seen_by[ids] += 1
-        offset = self.positions[ids] - keyframe.centre()
+        self.num_observations[ids] += 1
+        offset = self.positions[ids] - keyframe.center()
         self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
 
     def _free_rows(self, count: int) -> NDArray[np.int64]:
         """Rows that hold no point, those of former points first."""
-        free = np.flatnonzero(self.seen_by[: self.size] == 0)[:count]
+        free = np.flatnonzero(self.num_observations[: self.size] == 0)[:count]
         end = self.size + count - len(free)
         ids = np.concatenate([free, np.arange(self.size, end)])
         self._reserve(end)
@@ -241,10 +244,10 @@ class Map:
         return ids
 
     def _reserve(self, count: int) -> None:
-        counters = ("seen_by", "observers", "born", "became", "visible", "found", "moved")
+        counters = ("num_observations", "observers", "first_keyframe", "merged_into", "visible", "found", "moved")
         names = ("positions", "descriptors", "directions", "reach", *counters)
         while len(self.positions) < count:
             for name in names:
                 array = getattr(self, name)
-                blank = -1 if name == "became" else 0
+                blank = -1 if name == "merged_into" else 0
                 setattr(self, name, np.concatenate([array, np.full_like(array, blank)]))

@@ -23,10 +23,10 @@ def add_points(world: Map, keyframe: Keyframe) -> None:
 def fuse(world: Map, keyframe: Keyframe) -> None:
     """Look for the keyframe's points in its neighbours: more measurements; duplicates become the older point."""
     ids = keyframe.seen_points()
-    neighbours = [k for k in world.covisible(ids, _FUSE_KEYFRAMES + 1) if k is not keyframe]
-    pairs = [_look_for(world, ids, other) for other in neighbours]
+    neighbors = [k for k in world.covisible(ids, _FUSE_KEYFRAMES + 1) if k is not keyframe]
+    pairs = [_look_for(world, ids, other) for other in neighbors]
     if pairs:
-        _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbours])
+        _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbors])
 
 
 def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]) -> None:
@@ -41,7 +41,7 @@ def _look_for(world: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np
     """
     projected = world.project(world.unseen(ids, other), other.T_cw)
     matches = match_projected(projected, other.features, radius=3.0, max_distance=60)
-    current = other.point_ids[matches.corners]
+    current = other.point_ids[matches.keypoints]
     world.observe(other, matches.take(current < 0))
     return np.stack([matches.points, current])[:, current >= 0]
 
@@ -52,7 +52,7 @@ def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> N
     first, second = pairs[:, near]
     if len(first) == 0:
         return
-    later = world.born[first] - world.born[second]
+    later = world.first_keyframe[first] - world.first_keyframe[second]
     older = np.where(later == 0, first < second, later < 0)  # one order of all points, so that no two swap places
     old, new = np.where(older, second, first), np.where(older, first, second)
     gives_way = np.zeros(world.size, dtype=np.bool_)
@@ -63,8 +63,10 @@ def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> N
 
 def cull(world: Map, newest: int) -> None:
     """Drop young points that few keyframes confirmed or that frames rarely found where they should be."""
-    young = np.flatnonzero((world.born[: world.size] >= newest - _TRIAL) & (world.seen_by[: world.size] > 0))
-    weak = (world.born[young] == newest - _TRIAL) & (world.seen_by[young] < MIN_SEEN_BY)
+    young = np.flatnonzero(
+        (world.first_keyframe[: world.size] >= newest - _TRIAL) & (world.num_observations[: world.size] > 0)
+    )
+    weak = (world.first_keyframe[young] == newest - _TRIAL) & (world.num_observations[young] < MIN_SEEN_BY)
     weak |= world.found[young] < _MIN_FOUND * world.visible[young]
     drop_points(world, young[weak])
 

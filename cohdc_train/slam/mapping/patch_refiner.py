@@ -2,7 +2,7 @@
 
 A corner of ORB lies on a whole pixel of its pyramid level. The patch that was cut out where the point was first seen,
 turned and scaled as the camera has moved since, says where in the image the point is to a fraction of that. Such
-measurements are `precise` and weigh accordingly, in a frame's pose as in bundle adjustment. We depart from eq. 9 in
+measurements are `is_subpixel` and weigh accordingly, in a frame's pose as in bundle adjustment. We depart from eq. 9 in
 that A has four free entries: the patch is taken for a plane that faced the first camera.
 """
 
@@ -20,7 +20,7 @@ from cohdc_train.slam.mapping.map import Map
 
 
 @dataclass
-class Refiner:
+class PatchRefiner:
     """Keeps the patches of a map's points, of all but the coarsest corners, and moves measurements by them."""
 
     world: Map
@@ -41,15 +41,17 @@ class Refiner:
         if grown > 0:
             self._patches = np.concatenate([self._patches, np.zeros((grown, PATCH_PX, PATCH_PX), dtype=np.uint8)])
             self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
-        born = np.flatnonzero(self.world.born[: len(self._patches)] == keyframe.index)
-        self._patches[born] = 0  # blank, or a point without one would have that of the point whose row it took
-        corners = np.flatnonzero((keyframe.point_ids >= 0) & (keyframe.features.octaves <= MAX_LEVEL))
-        corners = corners[self.world.born[keyframe.point_ids[corners]] == keyframe.index]
-        ids, octaves = keyframe.point_ids[corners], keyframe.features.octaves[corners]
-        patches = self._pyramid.cut(keyframe.features.pixels[corners], octaves, PATCH_PX)
+        first_keyframe = np.flatnonzero(self.world.first_keyframe[: len(self._patches)] == keyframe.index)
+        self._patches[first_keyframe] = (
+            0  # blank, or a point without one would have that of the point whose row it took
+        )
+        keypoints = np.flatnonzero((keyframe.point_ids >= 0) & (keyframe.features.octaves <= MAX_LEVEL))
+        keypoints = keypoints[self.world.first_keyframe[keyframe.point_ids[keypoints]] == keyframe.index]
+        ids, octaves = keyframe.point_ids[keypoints], keyframe.features.octaves[keypoints]
+        patches = self._pyramid.cut(keyframe.features.pixels[keypoints], octaves, PATCH_PX)
         self._patches[ids] = np.rint(patches).reshape(-1, PATCH_PX, PATCH_PX)
         self._octaves[ids] = octaves
-        keyframe.features.precise[corners] = True  # where the patch lies, by which others are moved
+        keyframe.features.is_subpixel[keypoints] = True  # where the patch lies, by which others are moved
 
     def refine(self, features: Features, matches: Matches, T_cw: Array) -> Features:
         """The features with those matched corners moved that found a better place in the frame looked at.
@@ -57,30 +59,30 @@ class Refiner:
         T_cw: [4, 4] the frame's pose.
         """
         assert self._pyramid is not None
-        matches = matches.take(features.octaves[matches.corners] <= MAX_LEVEL)
+        matches = matches.take(features.octaves[matches.keypoints] <= MAX_LEVEL)
         if len(matches) == 0:
             return features
-        ids, corners = matches.points, matches.corners
-        octaves = features.octaves[corners]
+        ids, keypoints = matches.points, matches.keypoints
+        octaves = features.octaves[keypoints]
         A = affine(self.world, ids, T_cw)
         back = np.linalg.inv(A) * (SCALE ** (octaves - self._octaves[ids]))[:, None, None]
         template = warped(self._patches[ids], back, TEMPLATE_PX + 2)
-        shift, good = align(self._pyramid, features.pixels[corners], octaves, template)
-        rows = corners[good]
+        shift, good = align(self._pyramid, features.pixels[keypoints], octaves, template)
+        rows = keypoints[good]
         pixels, points = features.pixels.copy(), features.points.copy()
         pixels[rows] += shift[good] * SCALE ** octaves[good, None]
         undistort = self.world.camera.undistort  # the difference, for points may be unrolled (`shutter`)
         points[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
-        precise = np.zeros(len(features), dtype=np.bool_)
-        precise[rows] = True
-        return replace(features, pixels=pixels, points=points, precise=precise)
+        is_subpixel = np.zeros(len(features), dtype=np.bool_)
+        is_subpixel[rows] = True
+        return replace(features, pixels=pixels, points=points, is_subpixel=is_subpixel)
 
 
 def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
     """A of eq. 9 for n points: [n, 2, 2] px of a camera at T_cw per px of the keyframe where each was first seen."""
     camera, points = world.camera, world.positions[ids]
-    born, which = np.unique(world.born[ids], return_inverse=True)
-    T_bw = np.stack([world.pose(index) for index in born.tolist()])[which]
+    first_keyframe, which = np.unique(world.first_keyframe[ids], return_inverse=True)
+    T_bw = np.stack([world.pose(index) for index in first_keyframe.tolist()])[which]
     depth = np.einsum("nj,nj->n", T_bw[:, 2, :3], points) + T_bw[:, 2, 3]  # in the keyframe of its birth
     local = to_local(T_cw, points)
     across = T_cw[:3, :3] @ T_bw[:, :2, :3].transpose(0, 2, 1)  # [n, 3, 2] that keyframe's x and y axes

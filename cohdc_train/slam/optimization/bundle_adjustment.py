@@ -11,7 +11,7 @@ from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 from cohdc_train.slam.optimization.linear_solver import solve_symmetric
 from cohdc_train.slam.optimization.reprojection import (
     Observations,
-    Weighing,
+    ReprojectionModel,
     huber_weights,
     pose_jacobian,
     residual_jacobian,
@@ -64,15 +64,15 @@ def local_points(poses: Array, points: Array, problem: Problem) -> Array:
     return result
 
 
-def measurement_chi2(poses: Array, points: Array, problem: Problem, weighing: Weighing) -> Array:
+def measurement_chi2(poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel) -> Array:
     """[m] squared residual in sigmas; infinite where the point lies behind the camera."""
     local = local_points(poses, points, problem)
-    error = residuals(local, problem.seen, weighing)
+    error = residuals(local, problem.seen, reprojection)
     return np.where(local[:, 2] > 0.05, np.einsum("mi,mi->m", error, error), np.inf)
 
 
 def adjust(
-    poses: Array, points: Array, problem: Problem, weighing: Weighing, steps: int = 8, robust: bool = True
+    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, steps: int = 8, robust: bool = True
 ) -> tuple[Array, Array]:
     """Minimise the (Huber) cost of all measurements over the free poses and all points.
 
@@ -80,14 +80,14 @@ def adjust(
     must be fixed, or depth measured, for the problem to have one answer; damping keeps the step finite in any case.
     """
     damping = 1e-4
-    cost = _cost(poses, points, problem, weighing, robust)
+    cost = _cost(poses, points, problem, reprojection, robust)
     for _ in range(steps):
-        normal = _normal_equations(poses, points, problem, weighing, robust)
+        normal = _normal_equations(poses, points, problem, reprojection, robust)
         pose_step, point_step = _solve(normal, damping)
         new_poses = poses.copy()
         new_poses[problem.free] = exp_se3(pose_step) @ poses[problem.free]
         new_points = points + point_step
-        new_cost = _cost(new_poses, new_points, problem, weighing, robust)
+        new_cost = _cost(new_poses, new_points, problem, reprojection, robust)
         if new_cost > cost:
             damping *= 10
             continue
@@ -98,8 +98,8 @@ def adjust(
     return poses, points
 
 
-def _cost(poses: Array, points: Array, problem: Problem, weighing: Weighing, robust: bool) -> float:
-    error = residuals(local_points(poses, points, problem), problem.seen, weighing)
+def _cost(poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, robust: bool) -> float:
+    error = residuals(local_points(poses, points, problem), problem.seen, reprojection)
     chi2 = np.einsum("mi,mi->m", error, error)
     if not robust:
         return float(chi2.sum())
@@ -107,10 +107,12 @@ def _cost(poses: Array, points: Array, problem: Problem, weighing: Weighing, rob
     return float(np.where(chi2 <= limits, chi2, 2 * np.sqrt(limits * chi2) - limits).sum())
 
 
-def _normal_equations(poses: Array, points: Array, problem: Problem, weighing: Weighing, robust: bool) -> _Normal:
+def _normal_equations(
+    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, robust: bool
+) -> _Normal:
     local = local_points(poses, points, problem)
-    error = residuals(local, problem.seen, weighing)
-    derivative = residual_jacobian(local, problem.seen, weighing)
+    error = residuals(local, problem.seen, reprojection)
+    derivative = residual_jacobian(local, problem.seen, reprojection)
     if robust:
         weight = np.sqrt(huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.limits))
         error, derivative = error * weight[:, None], derivative * weight[:, None, None]

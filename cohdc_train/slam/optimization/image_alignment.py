@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.geometry.depth_image import Picture
+from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, to_local
 
 _LEVELS = 2
@@ -45,7 +45,7 @@ class Alignment:
     agreement: float
 
 
-def align(of_map: Picture, local: Picture, T: Array) -> Alignment | None:
+def align(of_map: DepthImage, local: DepthImage, T: Array) -> Alignment | None:
     """Refine T: [4, 4] camera of the map's picture to camera of the local one, m; coarse to fine.
 
     Returns None when the pictures hardly overlap or there is nothing to hold on to.
@@ -71,7 +71,7 @@ def align(of_map: Picture, local: Picture, T: Array) -> Alignment | None:
 class _Template:
     """The map's picture, with the steepest-descent image of its usable pixels."""
 
-    def __init__(self, picture: Picture) -> None:
+    def __init__(self, picture: DepthImage) -> None:
         camera, depth = picture.camera, picture.depth
         near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
         usable: NDArray[np.bool_] = np.asarray((near > 0) & (far - near < _EDGE * depth))
@@ -113,7 +113,7 @@ class _Comparison:
     agreement: float
 
 
-def _compare(template: _Template, local: Picture, T: Array) -> _Comparison | None:
+def _compare(template: _Template, local: DepthImage, T: Array) -> _Comparison | None:
     carried = to_local(T, template.points)
     z = np.maximum(carried[:, 2], 0.05)
     pixels = local.camera.project(np.column_stack([carried[:, :2], z]))
@@ -140,7 +140,7 @@ def _sample(image: NDArray[np.float32], pixels: Array, interpolation: int) -> Ar
     return np.asarray(found[0], dtype=np.float64)
 
 
-def _align_level(template: _Template, local: Picture, T: Array) -> Array | None:
+def _align_level(template: _Template, local: DepthImage, T: Array) -> Array | None:
     for _ in range(_STEPS):
         now = _compare(template, local, T)
         if now is None:

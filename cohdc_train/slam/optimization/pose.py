@@ -14,7 +14,7 @@ from cohdc_train.slam.optimization.reprojection import (
     MIN_DEPTH_M,
     Observations,
     Prior,
-    Weighing,
+    ReprojectionModel,
     chi_square,
     fill_pose_jacobian,
     huber_weights,
@@ -23,7 +23,12 @@ from cohdc_train.slam.optimization.reprojection import (
 
 
 def optimize_pose(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, rounds: int = 2, prior: Prior | None = None
+    T_cw: Array,
+    points: Array,
+    seen: Observations,
+    reprojection: ReprojectionModel,
+    rounds: int = 2,
+    prior: Prior | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Gauss-Newton on the six parameters of a pose, Huber-weighted; outliers are dropped and may return every round.
 
@@ -34,31 +39,31 @@ def optimize_pose(
     used = np.ones(len(points), dtype=np.bool_)
     for _ in range(rounds):
         if used.sum() >= 6:
-            T_cw = _refine(T_cw, points[used], seen.take(used), weighing, prior)
-        used = chi_square(T_cw, points, seen, weighing) <= limits
+            T_cw = _refine(T_cw, points[used], seen.take(used), reprojection, prior)
+        used = chi_square(T_cw, points, seen, reprojection) <= limits
     return T_cw, used
 
 
-def pose_information(T_cw: Array, points: Array, seen: Observations, weighing: Weighing) -> Array:
+def pose_information(T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
     """[6, 6] inverse covariance of a pose that these measurements decide; arguments as of optimize_pose."""
     local = to_local(T_cw, points)
     J = np.zeros((6, 3, len(points)))
-    fill_pose_jacobian(J, local, seen, weighing)
+    fill_pose_jacobian(J, local, seen, reprojection)
     rows = J.reshape(6, -1)
     return np.asarray(rows @ rows.T)
 
 
 def _refine(
-    T_cw: Array, points: Array, seen: Observations, weighing: Weighing, prior: Prior | None, steps: int = 8
+    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel, prior: Prior | None, steps: int = 8
 ) -> Array:
     limits = seen.limits
     J = np.zeros((6, 3, len(points)))
     for _ in range(steps):
         local = to_local(T_cw, points)
-        error = residuals(local, seen, weighing).T
+        error = residuals(local, seen, reprojection).T
         weight = huber_weights(np.einsum("im,im->m", error, error), limits)
         weight[local[:, 2] <= MIN_DEPTH_M] = 0.0
-        fill_pose_jacobian(J, local, seen, weighing)
+        fill_pose_jacobian(J, local, seen, reprojection)
         rows, weighted = J.reshape(6, -1), (J * weight).reshape(6, -1)
         H, g = weighted @ rows.T + 1e-9 * np.eye(6), weighted @ error.reshape(-1)
         if prior is not None:

@@ -59,7 +59,7 @@ def joined(parts: list[Observations]) -> Observations:
 
 
 @dataclass(frozen=True)
-class Weighing:
+class ReprojectionModel:
     """The camera and bf, px m: how far depth is trusted. 100 px m is a sigma of 1 cm at 1 m and 9 cm at 3 m."""
 
     camera: Camera
@@ -82,30 +82,30 @@ class Prior:
         return np.asarray(self.information @ np.concatenate([way, turn]))
 
 
-def residuals(local: Array, seen: Observations, weighing: Weighing) -> Array:
+def residuals(local: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
     """local: [m, 3] points in the camera frame, m. Returns [m, 3] prediction minus measurement, in sigmas."""
-    camera = weighing.camera
+    camera = reprojection.camera
     z = np.maximum(local[:, 2], MIN_DEPTH_M)
     result = np.empty((3, len(local))).T  # each residual's values side by side
     result[:, 0] = camera.fx * local[:, 0] / z + camera.cx - seen.pixels[:, 0]
     result[:, 1] = camera.fy * local[:, 1] / z + camera.cy - seen.pixels[:, 1]
-    disparity = weighing.bf / z - weighing.bf / seen.depths
+    disparity = reprojection.bf / z - reprojection.bf / seen.depths
     result[:, 2] = np.where(np.isnan(disparity), 0.0, disparity)
     result[:, :2] /= seen.sigmas[:, None]
     result[:, 2] /= seen.depth_sigmas
     return result
 
 
-def residual_jacobian(local: Array, seen: Observations, weighing: Weighing) -> Array:
+def residual_jacobian(local: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
     """d residuals / d local: [m, 3, 3], sigmas per m."""
-    camera = weighing.camera
+    camera = reprojection.camera
     reciprocal = 1.0 / np.maximum(local[:, 2], MIN_DEPTH_M)
     result = np.zeros((len(local), 3, 3))
     result[:, 0, 0] = camera.fx * reciprocal
     result[:, 0, 2] = -camera.fx * local[:, 0] * reciprocal**2
     result[:, 1, 1] = camera.fy * reciprocal
     result[:, 1, 2] = -camera.fy * local[:, 1] * reciprocal**2
-    result[:, 2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf * reciprocal**2)
+    result[:, 2, 2] = np.where(np.isnan(seen.depths), 0.0, -reprojection.bf * reciprocal**2)
     result[:, :2] /= seen.sigmas[:, None, None]
     result[:, 2] /= seen.depth_sigmas[:, None]
     return result
@@ -123,10 +123,10 @@ def pose_jacobian(local: Array, derivative: Array) -> Array:
     return result
 
 
-def chi_square(T_cw: Array, points: Array, seen: Observations, weighing: Weighing) -> Array:
+def chi_square(T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
     """[m] squared residual in sigmas; infinite for points that lie behind the camera."""
     local = to_local(T_cw, points)
-    chi2 = np.einsum("ij,ij->i", *(2 * (residuals(local, seen, weighing),)))
+    chi2 = np.einsum("ij,ij->i", *(2 * (residuals(local, seen, reprojection),)))
     return np.where(local[:, 2] > MIN_DEPTH_M, chi2, np.inf)
 
 
@@ -135,16 +135,16 @@ def huber_weights(chi2: Array, limits: Array) -> Array:
     return np.sqrt(np.minimum(1.0, limits / np.maximum(chi2, 1e-12)))
 
 
-def fill_pose_jacobian(J: Array, local: Array, seen: Observations, weighing: Weighing) -> None:
+def fill_pose_jacobian(J: Array, local: Array, seen: Observations, reprojection: ReprojectionModel) -> None:
     """J: [6, 3, m], zero at first: pose_jacobian of residual_jacobian, laid out for speed with its zeros left out."""
-    camera = weighing.camera
+    camera = reprojection.camera
     x, y = np.ascontiguousarray(local[:, :2].T)
     z = np.maximum(local[:, 2], MIN_DEPTH_M)
     u, v = J[:, 0], J[:, 1]
     J[0, 0] = camera.fx / (z * seen.sigmas)
     J[1, 1] = camera.fy / (z * seen.sigmas)
     J[2, 0], J[2, 1] = -u[0] * x / z, -v[1] * y / z
-    J[2, 2] = np.where(np.isnan(seen.depths), 0.0, -weighing.bf / (z * z * seen.depth_sigmas))
+    J[2, 2] = np.where(np.isnan(seen.depths), 0.0, -reprojection.bf / (z * z * seen.depth_sigmas))
     J[3] = y * J[2]  # a turn moves the point by phi x local
     J[3, 1] -= z * v[1]
     J[4] = -x * J[2]

@@ -15,7 +15,7 @@ from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_
 from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.runtime.executors import NICE
-from cohdc_train.slam.runtime.latest_slot import Slot
+from cohdc_train.slam.runtime.latest_slot import LatestSlot
 
 Outline = Callable[[View], tuple[Mask, float]]
 
@@ -43,8 +43,8 @@ class AsyncMasks:
         self.segment_ms: list[float] = []
         self._outline = outline
         self._carried = CarriedMasks()
-        self._jobs: Slot[Job] = Slot()
-        self._results: Slot[_Done] = Slot()
+        self._jobs: LatestSlot[Job] = LatestSlot()
+        self._results: LatestSlot[_Done] = LatestSlot()
         self._busy = False
         self._worker = threading.Thread(target=self._work, name="segmenter", daemon=True)
 

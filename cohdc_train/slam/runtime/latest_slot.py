@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class Slot(Generic[T]):
+class LatestSlot(Generic[T]):
     """Holds one item at most. What a newer one replaces before it was taken is dropped and counted."""
 
     def __init__(self) -> None:

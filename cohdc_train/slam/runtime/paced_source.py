@@ -10,7 +10,7 @@ from typing import Protocol
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.sources import Source
-from cohdc_train.slam.runtime.latest_slot import Slot
+from cohdc_train.slam.runtime.latest_slot import LatestSlot
 
 
 class Clock(Protocol):
@@ -37,7 +37,7 @@ class WallClock:
         time.sleep(max(moment - self.now(), 0.0))
 
 
-class Paced:
+class PacedSource:
     """A source whose views come when they are due. Iterate once, inside `with`.
 
     The first view starts the clock when it has been dealt with: until then nothing is known of the place, and masks
@@ -57,7 +57,7 @@ class Paced:
         self.behind = 0.0
         self._source = source
         self._clock = clock or WallClock()
-        self._slot: Slot[tuple[View, float]] = Slot()
+        self._slot: LatestSlot[tuple[View, float]] = LatestSlot()
         self._stop = threading.Event()
         self._reader: threading.Thread | None = None
         self._due = 0.0  # when the view was that was given out last
@@ -82,7 +82,7 @@ class Paced:
     def __len__(self) -> int:
         return len(self._source)
 
-    def __enter__(self) -> "Paced":
+    def __enter__(self) -> "PacedSource":
         return self
 
     def __exit__(

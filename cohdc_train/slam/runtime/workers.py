@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from cohdc_train.slam.dynamics.mask_sources import FolderMasks, MaskSource, ModelMasks, no_masks
-from cohdc_train.slam.frame import OnPose, Pose
+from cohdc_train.slam.dynamics.mask_sources import MaskFolder, MaskSource, SegmenterMasks, no_masks
+from cohdc_train.slam.frame import Pose, PoseCallback
 from cohdc_train.slam.io.results import quantiles
 from cohdc_train.slam.io.sources import Source
 from cohdc_train.slam.runtime.async_masks import AsyncMasks
 from cohdc_train.slam.runtime.executors import worker_process
-from cohdc_train.slam.runtime.paced_source import Paced
+from cohdc_train.slam.runtime.paced_source import PacedSource
 
 
 @dataclass(frozen=True)
 class Workers:
     """The parts of a run that others wait for no longer. masks: None when nothing is masked."""
 
-    source: Paced
+    source: PacedSource
     masks: AsyncMasks | None
     executor: Executor
 
@@ -30,7 +30,7 @@ class Workers:
         """Every frame's mask."""
         return self.masks or no_masks
 
-    def answering(self, on_pose: OnPose | None) -> OnPose:
+    def answering(self, on_pose: PoseCallback | None) -> PoseCallback:
         """The same, after the source has learnt that there is an answer."""
 
         def answered(pose: Pose) -> None:
@@ -56,12 +56,12 @@ class Workers:
 
 
 @contextmanager
-def workers(source: Source, masks: FolderMasks | ModelMasks | None) -> Iterator[Workers]:
+def workers(source: Source, masks: MaskFolder | SegmenterMasks | None) -> Iterator[Workers]:
     """Start them; when the block ends, they end."""
     with ExitStack() as stack:
         executor = stack.enter_context(worker_process())
         beside = None if masks is None else stack.enter_context(AsyncMasks(masks.outline))
-        yield Workers(stack.enter_context(Paced(source)), beside, executor)
+        yield Workers(stack.enter_context(PacedSource(source)), beside, executor)
 
 
 def _milliseconds(seconds: list[float]) -> dict[str, float]:

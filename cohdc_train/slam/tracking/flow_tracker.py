@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.keypoints import Corners, Features
+from cohdc_train.slam.features.keypoints import Features, Keypoints
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.features.orb import gray_of
 from cohdc_train.slam.geometry.camera import Camera
@@ -20,9 +20,9 @@ from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
-from cohdc_train.slam.optimization.reprojection import Weighing
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 from cohdc_train.slam.tracking.localizer import Fit
-from cohdc_train.slam.tracking.motion_model import Expectation
+from cohdc_train.slam.tracking.motion_model import Prediction
 
 _BETWEEN = 2  # frames in a row: ten times a second the map is consulted
 _AT_MOST = 5  # while there is no time for more
@@ -48,15 +48,15 @@ class _Start:
 
     gray: NDArray[np.uint8]
     ids: NDArray[np.int64]
-    corners: Corners
+    keypoints: Keypoints
     off: Array
     masked: NDArray[np.bool_]
     reference: Keyframe | None
 
     def take(self, rows: NDArray[np.int64]) -> "_Start":
         """The same with the chosen points."""
-        ids, corners = self.ids[rows], self.corners.take(rows)
-        return replace(self, ids=ids, corners=corners, off=self.off[rows], masked=self.masked[rows])
+        ids, keypoints = self.ids[rows], self.keypoints.take(rows)
+        return replace(self, ids=ids, keypoints=keypoints, off=self.off[rows], masked=self.masked[rows])
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,15 @@ class Followed:
     """Points that flow found. ids: [m] int64, of the map; corners: where they are, m of them."""
 
     ids: NDArray[np.int64]
-    corners: Corners
+    keypoints: Keypoints
 
 
 class FlowTracker:
     """The poses of the frames after a matched one, without corners of their own."""
 
-    def __init__(self, world: Map, weighing: Weighing) -> None:
+    def __init__(self, world: Map, reprojection: ReprojectionModel) -> None:
         self.map = world
-        self._weighing = weighing
+        self._reprojection = reprojection
         self._start: _Start | None = None
         self._followed = 0
         self._set_out = self._agree = 0  # points
@@ -88,11 +88,11 @@ class FlowTracker:
         self._start, self._followed = None, 0
         if fit is None or len(fit.matches) < _LEAST:
             return
-        rows = fit.matches.corners
-        corners = features.corners(rows)
-        off = corners.pixels - self._seen_from(fit.T_cw, fit.matches.points)
-        masked = _covered(corners.pixels, mask)
-        self._start = _Start(gray_of(rgb), fit.matches.points, corners, off, masked, fit.reference)
+        rows = fit.matches.keypoints
+        keypoints = features.keypoints(rows)
+        off = keypoints.pixels - self._seen_from(fit.T_cw, fit.matches.points)
+        masked = _covered(keypoints.pixels, mask)
+        self._start = _Start(gray_of(rgb), fit.matches.points, keypoints, off, masked, fit.reference)
 
     def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
         """Look for the points in the next frame; None when there is nothing to look for.
@@ -107,7 +107,7 @@ class FlowTracker:
             before = before.take(np.flatnonzero(before.ids % _TURNS == self._followed % _TURNS))
         self._set_out = len(before.ids)
         guess = (self._seen_from(T_cw, before.ids) + before.off).astype(np.float32)
-        starts, flags = before.corners.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
+        starts, flags = before.keypoints.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             before.gray, gray_of(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
         )
@@ -117,10 +117,10 @@ class FlowTracker:
         known = before.ids[rows]
         ids, first = np.unique(self.map.current(known), return_index=True)
         rows, same = rows[first], ids == known[first]
-        corners = before.corners.take(rows)
-        return Followed(ids, replace(corners, pixels=pixels[rows], precise=corners.precise & same))
+        keypoints = before.keypoints.take(rows)
+        return Followed(ids, replace(keypoints, pixels=pixels[rows], is_subpixel=keypoints.is_subpixel & same))
 
-    def locate(self, followed: Followed, features: Features, expected: Expectation) -> Fit | None:
+    def locate(self, followed: Followed, features: Features, expected: Prediction) -> Fit | None:
         """The pose on which enough of the points agree. features: of the followed corners."""
         assert self._start is not None
         least = max(_LEAST, _SHARE * self._set_out)
@@ -129,11 +129,11 @@ class FlowTracker:
         matches = Matches(followed.ids, np.arange(len(features)))
         points, seen = self.map.measured(matches, features)
         prior = expected.given(len(features))
-        T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._weighing, prior=prior)
+        T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._reprojection, prior=prior)
         self._agree = int(inlier.sum())
         if self._agree < least:
             return None
-        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
+        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._reprojection)
         return Fit(T_cw, matches.take(inlier), self._start.reference, prior, information)
 
     @property

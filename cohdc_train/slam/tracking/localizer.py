@@ -14,8 +14,8 @@ from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
 from cohdc_train.slam.optimization.ransac import ransac_pose
-from cohdc_train.slam.optimization.reprojection import Prior, Weighing
-from cohdc_train.slam.tracking.motion_model import Expectation
+from cohdc_train.slam.optimization.reprojection import Prior, ReprojectionModel
+from cohdc_train.slam.tracking.motion_model import Prediction
 
 LOCAL_KEYFRAMES = 15
 _MIN_FIRST = 15  # inliers of the first, rough pose
@@ -50,9 +50,9 @@ class Localizer:
     judges: groups of points that move against the rest are left out and lose weight.
     """
 
-    def __init__(self, world: Map, weighing: Weighing, seed: int, judges: bool) -> None:
+    def __init__(self, world: Map, reprojection: ReprojectionModel, seed: int, judges: bool) -> None:
         self.map = world
-        self._weighing = weighing
+        self._reprojection = reprojection
         self._judges = judges
         self._rng = np.random.default_rng(seed)
 
@@ -61,7 +61,7 @@ class Localizer:
         features: Features,
         rgb: NDArray[np.uint8],
         last: Fit,
-        expected: Expectation,
+        expected: Prediction,
         flown: Fit | None = None,
     ) -> Fit | None:
         """The frame after `last`. Where it sees little, what was expected counts as well.
@@ -94,7 +94,7 @@ class Localizer:
                 return fit
         return None
 
-    def _follow(self, features: Features, last: Fit, expected: Expectation) -> Fit | None:
+    def _follow(self, features: Features, last: Fit, expected: Prediction) -> Fit | None:
         """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
         for guess, radius in ((expected.prior.T_cw, 15.0), (last.T_cw, 40.0)):
             projected = self.map.project(last.matches.points, guess)
@@ -113,11 +113,11 @@ class Localizer:
             return None
         T_cw, agree = found
         matches = matches.take(agree)
-        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._weighing, rounds=1)
+        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._reprojection, rounds=1)
         return Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
 
     def _against_local_map(
-        self, features: Features, rough: Fit, minimum: int, expected: Expectation | None = None
+        self, features: Features, rough: Fit, minimum: int, expected: Prediction | None = None
     ) -> Fit | None:
         """The pose from all points of the keyframes around."""
         keyframes = self.map.covisible(rough.matches.points, LOCAL_KEYFRAMES)
@@ -125,7 +125,7 @@ class Localizer:
         matches = match_projected(projected, features, radius=5.0)
         points, seen = self.map.measured(matches, features)
         prior = None if expected is None else expected.given(len(matches))
-        T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._weighing, prior=prior)
+        T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._reprojection, prior=prior)
         if inlier.sum() < minimum:
             return None
         matches = matches.take(inlier)
@@ -147,13 +147,13 @@ class Localizer:
         points, seen = self.map.measured(fit.matches, features)
         if self._judges:
             known = self.map.found[ids]
-            T_cw, inlier, moving = pose_of_rest(fit.T_cw, points, seen, self._weighing, known, fit.prior)
+            T_cw, inlier, moving = pose_of_rest(fit.T_cw, points, seen, self._reprojection, known, fit.prior)
         else:
-            T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._weighing, prior=fit.prior)
+            T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._reprojection, prior=fit.prior)
             moving = np.zeros(len(ids), dtype=np.bool_)
         if inlier.sum() < _MIN_TRACKED:
             return None
         if self._judges:
-            self.map.judge(ids[inlier], ids[moving])
-        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._weighing)
+            self.map.update_static_odds(ids[inlier], ids[moving])
+        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._reprojection)
         return Fit(T_cw, fit.matches.take(~moving), fit.reference, fit.prior, information)

@@ -21,7 +21,7 @@ _SURPRISE = 100.0  # squared standard deviations of a pose, from which on it is 
 
 
 @dataclass(frozen=True)
-class Expectation:
+class Prediction:
     """Where a frame should be. calm: of late the camera has moved as foreseen."""
 
     prior: Prior
@@ -32,7 +32,7 @@ class Expectation:
         return self.prior if self.calm and points < FEW else None
 
 
-class Motion:
+class MotionModel:
     """Pose and velocity of the latest frame with their joint covariance [12, 12], of (m, rad, m/s, rad/s).
 
     Errors are those of a small motion in the camera's frame: T_true = exp(error) T.
@@ -59,12 +59,12 @@ class Motion:
         """[6] velocity, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t). None while it is not known."""
         return self._velocity if self._t is not None and 0 < self._step <= LONGEST else None
 
-    def expected(self, t: float) -> Expectation:
+    def expected(self, t: float) -> Prediction:
         """Where the camera is at t, s, later than the latest frame.
 
         After a pause it is held to have gone on for as long as its velocity is known to say something.
         """
-        return Expectation(self._prior(t, self._predicted(t)), self._unrest < 1)
+        return Prediction(self._prior(t, self._predicted(t)), self._unrest < 1)
 
     def found(self, t: float, T_cw: Array, information: Array, pull: Array = _NOTHING) -> None:
         """The frame at t is at T_cw. information: [6, 6] of what it saw; pull: [6] `Prior.pull` of what was expected,

@@ -2,15 +2,15 @@
 
 import time
 
-from cohdc_train.slam.frame import OnPose, Pose
+from cohdc_train.slam.frame import Pose, PoseCallback
 from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.tracking.localizer import Fit
 
 
-class Answer:
+class PoseReporter:
     """A frame's pose from when it is known, and the time that took from the answer's making on."""
 
-    def __init__(self, t: float, on_pose: OnPose | None) -> None:
+    def __init__(self, t: float, on_pose: PoseCallback | None) -> None:
         self._t, self._on_pose = t, on_pose
         self._start = time.perf_counter()
         self._known: float | None = None

@@ -9,29 +9,29 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import MAX_KEYPOINTS, Method
-from cohdc_train.slam.dynamics.dynamic_mask import DynamicMask
-from cohdc_train.slam.dynamics.free_space import Geometry
+from cohdc_train.slam.dynamics.dynamic_mask import DynamicMaskEstimator
+from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker
 from cohdc_train.slam.features.descriptors import thumbnail
-from cohdc_train.slam.features.keypoints import Corners, Features
+from cohdc_train.slam.features.keypoints import Features, Keypoints
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import FeatureExtractor, gray_of
-from cohdc_train.slam.features.rolling_shutter import unrolled
-from cohdc_train.slam.frame import OnPose, Pose
+from cohdc_train.slam.features.orb import OrbExtractor, gray_of
+from cohdc_train.slam.features.rolling_shutter import undo_rolling_shutter
+from cohdc_train.slam.frame import Pose, PoseCallback
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.geometry.depth_image import take_picture
+from cohdc_train.slam.geometry.depth_image import make_depth_image
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse
 from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
-from cohdc_train.slam.mapping.frame_history import FrameLog
-from cohdc_train.slam.mapping.global_bundle_adjustment import SeenFrames
+from cohdc_train.slam.mapping.frame_history import FrameHistory
+from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames
 from cohdc_train.slam.mapping.keyframe import Keyframe
-from cohdc_train.slam.mapping.local_mapper import LocalMapping
+from cohdc_train.slam.mapping.local_mapper import LocalMapper
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.patch_refiner import Refiner
-from cohdc_train.slam.optimization.reprojection import Weighing
+from cohdc_train.slam.mapping.patch_refiner import PatchRefiner
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 from cohdc_train.slam.tracking.flow_tracker import FlowTracker
 from cohdc_train.slam.tracking.localizer import LOCAL_KEYFRAMES, Fit, Localizer
-from cohdc_train.slam.tracking.motion_model import Expectation, Motion
-from cohdc_train.slam.tracking.pose_reporter import Answer
+from cohdc_train.slam.tracking.motion_model import MotionModel, Prediction
+from cohdc_train.slam.tracking.pose_reporter import PoseReporter
 
 MIN_START = 50  # points a first keyframe needs
 _KEYFRAME_SHARE = 0.82  # of the inliers right after the last keyframe: with fewer the next is due
@@ -81,26 +81,28 @@ class Tracker:
         self.budget = features
         self.features: Features | None = None  # of the latest frame
         self.mask: NDArray[np.bool_] | None = None  # as given; a matched frame's less what is at rest, and what moves
-        self._extract = FeatureExtractor(camera, features)
-        self._geometry = Geometry(camera)
-        self._dynamic_mask = DynamicMask(self._geometry)
-        self._refiner = Refiner(self.map) if self.method.refinement else None
-        self._weighing = Weighing(camera, camera.fx * camera.baseline) if camera.baseline else Weighing(camera)
-        self._localizer = Localizer(self.map, self._weighing, seed, self.method.static_weights)
-        self._flow = FlowTracker(self.map, self._weighing) if executor is not None and self.method.flow else None
+        self._extract = OrbExtractor(camera, features)
+        self._geometry = FreeSpaceChecker(camera)
+        self._dynamic_mask = DynamicMaskEstimator(self._geometry)
+        self._refiner = PatchRefiner(self.map) if self.method.refinement else None
+        self._reprojection = (
+            ReprojectionModel(camera, camera.fx * camera.baseline) if camera.baseline else ReprojectionModel(camera)
+        )
+        self._localizer = Localizer(self.map, self._reprojection, seed, self.method.static_weights)
+        self._flow = FlowTracker(self.map, self._reprojection) if executor is not None and self.method.flow else None
         in_parts = self._flow is not None
-        loop_closer = LoopCloser(self.map, self._weighing, seed) if self.method.loops else None
-        self._mapping = LocalMapping(
-            self.map, self._weighing, self.method, self._refiner, loop_closer, executor, in_parts
+        loop_closer = LoopCloser(self.map, self._reprojection, seed) if self.method.loops else None
+        self._mapping = LocalMapper(
+            self.map, self._reprojection, self.method, self._refiner, loop_closer, executor, in_parts
         )
         self._spent = spent
-        self._motion = Motion()
+        self._motion = MotionModel()
         self._last: Fit | None = None
         self._latest_t: float | None = None  # s, of the latest frame
         self._reference_inliers = 0.0
         self._since_keyframe = 0
-        self._log = FrameLog()
-        self._seen = SeenFrames()
+        self._log = FrameHistory()
+        self._seen = ObservedFrames()
 
     def track(
         self,
@@ -109,7 +111,7 @@ class Tracker:
         t: float,
         mask: NDArray[np.bool_] | None = None,
         depth_t: float | None = None,
-        on_pose: OnPose | None = None,
+        on_pose: PoseCallback | None = None,
     ) -> Pose:
         """Find the camera of the next frame.
 
@@ -120,7 +122,7 @@ class Tracker:
         before the work that the frame makes for those to come; what is returned may be more exact.
         """
         self._check_input(rgb, depth_m, t, mask)
-        answer = Answer(t, on_pose)
+        answer = PoseReporter(t, on_pose)
         self._let(self._mapping.collect)
         frame = _Frame(rgb, depth_m, t, mask, None if depth_t is None else depth_t - t)
         expected = None if self._last is None else self._motion.expected(t)
@@ -175,7 +177,7 @@ class Tracker:
         """Wait for mapping that runs beside tracking, and adjust the whole map; the trajectory is better for it."""
         self._mapping.finish()
         if self.method.global_adjustment and len(self.map.keyframes) > 1:
-            self._seen.adjust(self.map, self._weighing, self._log)
+            self._seen.adjust(self.map, self._reprojection, self._log)
 
     @property
     def loops(self) -> int:
@@ -190,19 +192,19 @@ class Tracker:
         """
         return self._log.trajectory(self.map, self.method.smoothing)
 
-    def _by_flow(self, flow: FlowTracker, frame: _Frame, expected: Expectation) -> Fit | None:
+    def _by_flow(self, flow: FlowTracker, frame: _Frame, expected: Prediction) -> Fit | None:
         """The pose by what the last matched frame saw; None where too little of it is found."""
         followed = flow.follow(frame.rgb, frame.mask, expected.prior.T_cw)
         if followed is None:
             return None
-        features = self._measured(followed.corners, frame, frame.mask)
+        features = self._measured(followed.keypoints, frame, frame.mask)
         fit = flow.locate(followed, features, expected)
         if fit is None:
             return None
         self.features, self.mask = features, frame.mask
         return fit
 
-    def _by_map(self, frame: _Frame, expected: Expectation | None, flown: Fit | None) -> tuple[Fit | None, bool]:
+    def _by_map(self, frame: _Frame, expected: Prediction | None, flown: Fit | None) -> tuple[Fit | None, bool]:
         """The pose against the map, or the one by flow where that does not answer; and whether the frame may become a
         keyframe."""
         mask = self._dynamic(frame, expected)
@@ -218,7 +220,7 @@ class Tracker:
         return fit, not covered
 
     def _matched(
-        self, frame: _Frame, mask: _Mask | None, expected: Expectation | None, flown: Fit | None
+        self, frame: _Frame, mask: _Mask | None, expected: Prediction | None, flown: Fit | None
     ) -> tuple[Features, Fit | None]:
         """The corners of a frame and its pose against the map: by where patches put them, else by where they lie."""
         features = self._measured(self._extract.find(frame.rgb, mask), frame, mask)
@@ -229,22 +231,22 @@ class Tracker:
         settled = self._localizer.settle(refined, fit)
         return (features, self._localizer.settle(features, fit)) if settled is None else (refined, settled)
 
-    def _dynamic(self, frame: _Frame, expected: Expectation | None) -> _Mask | None:
+    def _dynamic(self, frame: _Frame, expected: Prediction | None) -> _Mask | None:
         """The mask after depth had its say, where the camera is expected."""
         if not self.method.geometry or self._last is None or expected is None:
             return frame.mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
         return self._dynamic_mask.of(frame.mask, frame.depth_m, expected.prior.T_cw, around, frame.t)
 
-    def _measured(self, corners: Corners, frame: _Frame, mask: _Mask | None) -> Features:
+    def _measured(self, keypoints: Keypoints, frame: _Frame, mask: _Mask | None) -> Features:
         """The corners of a frame, all put at its one time."""
         twist = self._motion.twist
         lag = None if twist is None or frame.late is None else exp_se3(twist * frame.late)
-        features = self._extract.measure(corners, frame.depth_m, mask, lag)
-        return features if twist is None else unrolled(features, self.camera, twist)
+        features = self._extract.measure(keypoints, frame.depth_m, mask, lag)
+        return features if twist is None else undo_rolling_shutter(features, self.camera, twist)
 
     def _locate(
-        self, features: Features, rgb: NDArray[np.uint8], expected: Expectation | None, flown: Fit | None
+        self, features: Features, rgb: NDArray[np.uint8], expected: Prediction | None, flown: Fit | None
     ) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
@@ -274,7 +276,7 @@ class Tracker:
     def _wants_keyframe(self, fit: Fit) -> bool:
         if fit.reference is None:
             return True
-        old = self.map.born[: self.map.size] < self.map.joined - _OLD
+        old = self.map.first_keyframe[: self.map.size] < self.map.joined - _OLD
         if np.count_nonzero(old[fit.matches.points]) >= _KNOWN * len(fit.matches):
             return len(fit.matches) < _KNOWN_SHARE * float(old[fit.reference.seen_points()].sum())
         share = _KEYFRAME_SHARE if self._flow is None else _SELDOM_ASKED_SHARE
@@ -286,15 +288,15 @@ class Tracker:
         assert self.features is not None
         features, mask = self.features, self.mask
         point_ids = np.full(len(features), -1)
-        point_ids[fit.matches.corners] = fit.matches.points
+        point_ids[fit.matches.keypoints] = fit.matches.points
         pictures = thumbnail(frame.rgb), self._geometry.nearest(frame.depth_m)
         keyframe = Keyframe(self.map.joined, frame.t, fit.T_cw, features, point_ids, *pictures)
-        self._mapping.insert(keyframe, lambda: take_picture(frame.rgb, frame.depth_m, mask, self.camera))
+        self._mapping.insert(keyframe, lambda: make_depth_image(frame.rgb, frame.depth_m, mask, self.camera))
         self._motion.carry(inverse(fit.T_cw) @ keyframe.T_cw)
         self._since_keyframe = 0
         self._reference_inliers = 0.0
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
-        matches = Matches(keyframe.point_ids[corners], corners)
+        keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+        matches = Matches(keyframe.point_ids[keypoints], keypoints)
         return Fit(keyframe.T_cw, matches, keyframe, information=fit.information)
 
     def _remember(self, fit: Fit | None, frame: _Frame, matched: bool, hurry: bool = False) -> None:

@@ -61,8 +61,8 @@ class KeyframeImages:
     def __iter__(self) -> Iterator[Frame]:
         """(t s, colour [H, W, 3] RGB, unmasked depth [H, W] m, 0 = none) of every keyframe, without distortion."""
         self._file.seek(0)
-        for t, colour, depth in self._index:
-            jpeg, png = (np.frombuffer(self._file.read(size), np.uint8) for size in (colour, depth))
+        for t, color, depth in self._index:
+            jpeg, png = (np.frombuffer(self._file.read(size), np.uint8) for size in (color, depth))
             bgr = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), np.uint8)
             yield (
                 t,
@@ -113,12 +113,12 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
             local = rays[seen] * depth[seen][:, None]
             grid.add((local - poses[t][:3, 3]) @ poses[t][:3, :3], rgb[seen], count)
             count += 1
-    points, colours = grid.cells(min(count, 2))
+    points, colors = grid.cells(min(count, 2))
     balance = np.zeros(len(points), dtype=np.int32)
     for t, _, depth in images:
         if t in poses:
             balance += _evidence(points, depth, poses[t], camera)
-    return Cloud(points[balance > 0], colours[balance > 0])
+    return Cloud(points[balance > 0], colors[balance > 0])
 
 
 def _rays(camera: Camera) -> Array:

@@ -15,7 +15,7 @@ from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.io.ply import write_ply
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.depth_fusion import KeyframeImages, fuse
-from cohdc_train.slam.visualization.point_cloud import PointColours
+from cohdc_train.slam.visualization.point_cloud import PointColors
 from cohdc_train.slam.visualization.top_view import from_above
 
 _VOXEL = 0.01  # m
@@ -26,7 +26,7 @@ class MapFiles:
 
     def __init__(self, camera: Camera, folder: Path, cloud: bool) -> None:
         self._folder = folder
-        self._colours = PointColours()
+        self._colors = PointColors()
         self._open = ExitStack()
         self._images = self._open.enter_context(KeyframeImages(camera, folder)) if cloud else None
 
@@ -38,19 +38,19 @@ class MapFiles:
 
     def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
         """Note colours of points, and keep the pictures of keyframes for the cloud."""
-        self._colours(view, mask, record, tracker)
+        self._colors(view, mask, record, tracker)
         if self._images is not None:
             self._images(view, mask, record, tracker)
 
     def write(self, tracker: Tracker) -> None:
         """Write the files, with keyframes and points where the map has them now."""
-        cloud = self._colours.cloud(tracker.map)
-        write_ply(self._folder / "map.ply", cloud.points, cloud.colours)
+        cloud = self._colors.cloud(tracker.map)
+        write_ply(self._folder / "map.ply", cloud.points, cloud.colors)
         stamps, poses = tracker.trajectory()
         if self._images is not None:
             frames = dict(zip(stamps.tolist(), inverse(poses), strict=True))  # with keyframes that left the map
             cloud = fuse(self._images, frames, tracker.camera, _VOXEL)
-            write_ply(self._folder / "cloud.ply", cloud.points, cloud.colours)
+            write_ply(self._folder / "cloud.ply", cloud.points, cloud.colors)
         if len(poses):
             picture = cv2.cvtColor(from_above(cloud, list(poses)), cv2.COLOR_RGB2BGR)
             write_bytes(self._folder / "map.png", cv2.imencode(".png", picture)[1].tobytes())

@@ -18,31 +18,31 @@ class Cloud:
     """points: [n, 3] in the world, m; colours: [n, 3] uint8 RGB."""
 
     points: Array
-    colours: NDArray[np.uint8]
+    colors: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-class PointColours:
+class PointColors:
     """Watches a run and keeps the colours of the map's keyframes' corners (some 3 kB each), for the points they are."""
 
     def __init__(self) -> None:
-        self._colours: dict[float, NDArray[np.uint8]] = {}  # t of a keyframe -> [corners, 3] RGB
+        self._colors: dict[float, NDArray[np.uint8]] = {}  # t of a keyframe -> [corners, 3] RGB
 
     def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
         """Note the colours when the frame became a keyframe, and forget those of keyframes that left the map."""
         if record.pose.keyframe and tracker.features is not None:
             columns, rows = np.rint(tracker.features.pixels).astype(np.int64).T
-            self._colours[view.t] = view.rgb[rows, columns]
+            self._colors[view.t] = view.rgb[rows, columns]
             there = {keyframe.t for keyframe in tracker.map.keyframes}
-            self._colours = {t: colours for t, colours in self._colours.items() if t in there}
+            self._colors = {t: colors for t, colors in self._colors.items() if t in there}
 
     def cloud(self, world: Map) -> Cloud:
         """The points that at least three keyframes see (all of them, in a map of fewer), in the last one's colours."""
-        colours = np.zeros((world.size, 3), dtype=np.uint8)
+        colors = np.zeros((world.size, 3), dtype=np.uint8)
         for keyframe in world.keyframes:
-            corners = np.flatnonzero(keyframe.point_ids >= 0)
-            colours[keyframe.point_ids[corners]] = self._colours[keyframe.t][corners]
-        enough = world.seen_by[: world.size] >= max(1, min(_SEEN_BY, len(world.keyframes)))
-        return Cloud(world.positions[: world.size][enough], colours[enough])
+            keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+            colors[keyframe.point_ids[keypoints]] = self._colors[keyframe.t][keypoints]
+        enough = world.num_observations[: world.size] >= max(1, min(_SEEN_BY, len(world.keyframes)))
+        return Cloud(world.positions[: world.size][enough], colors[enough])

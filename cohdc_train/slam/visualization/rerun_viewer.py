@@ -13,7 +13,7 @@ from cohdc_train.errors import CohdcError, MissingExtraError
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.slam.visualization.point_cloud import PointColours
+from cohdc_train.slam.visualization.point_cloud import PointColors
 
 _LAST = 5.0  # s that rerun has for the rest when a run is over
 _MEMORY = "25%"  # of the machine's, which the viewer may fill before it forgets the oldest
@@ -37,7 +37,7 @@ class Viewer:
             raise MissingExtraError(message) from error
         self._rerun: Any = rerun
         self._stream = rerun.RecordingStream("cohdc slam")
-        self._colours = PointColours()
+        self._colors = PointColors()
         self._start: float | None = None
         self._file = file
         self._open(window)
@@ -119,8 +119,8 @@ class Viewer:
             if ms > 0:
                 log(f"ms/{stage}", rerun.Scalars(ms))
         log("inliers", rerun.Scalars(pose.inliers))
-        self._colours(view, mask, record, tracker)
+        self._colors(view, mask, record, tracker)
         if pose.keyframe:
-            cloud = self._colours.cloud(tracker.map)
-            log("world/points", rerun.Points3D(cloud.points, colors=cloud.colours, radii=0.006))
+            cloud = self._colors.cloud(tracker.map)
+            log("world/points", rerun.Points3D(cloud.points, colors=cloud.colors, radii=0.006))
             log("world/way", rerun.LineStrips3D([tracker.map.way()[:, :3, 3]], colors=[_WAY]))

@@ -29,7 +29,7 @@ def from_above(cloud: Cloud, poses: Sequence[Array]) -> NDArray[np.uint8]:
     axes = np.stack([np.cross(forward, up), -forward], axis=1)  # [3, 2] to the right, and down in the picture
     height = cloud.points @ up
     keep = height < (stack[:, :3, 3] @ up).max() + _ABOVE
-    points, colours = cloud.points[keep], cloud.colours[keep]
+    points, colors = cloud.points[keep], cloud.colors[keep]
     order = np.argsort(height[keep], kind="stable")  # what lies higher is drawn later
     flat, way = points[order] @ axes, stack[:, :3, 3] @ axes
     low, high = np.quantile(np.concatenate([flat, way]), [0.005, 0.995], axis=0)
@@ -43,7 +43,7 @@ def from_above(cloud: Cloud, poses: Sequence[Array]) -> NDArray[np.uint8]:
         for dy in range(-radius, radius + 1):
             x, y = columns + dx, lines + dy
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < rows)
-            image[y[inside], x[inside]] = colours[order][inside]
+            image[y[inside], x[inside]] = colors[order][inside]
     path = np.rint((way - low) * scale + _BORDER).astype(np.int32)
     cv2.polylines(image, [path.reshape(-1, 1, 2)], False, _RED, 2, cv2.LINE_AA)
     return image

@@ -21,11 +21,11 @@ class VoxelGrid:
         self._spans = np.zeros((0, 2), dtype=np.int32)  # first and last picture that filled the cube
         self._waiting: list[tuple[NDArray[np.int64], Array, NDArray[np.int32]]] = []
 
-    def add(self, points: Array, colours: NDArray[np.uint8], picture: int) -> None:
+    def add(self, points: Array, colors: NDArray[np.uint8], picture: int) -> None:
         """points: [n, 3] m; colours: [n, 3] RGB; picture: its number, which tells cubes seen once from others."""
         cells = np.floor(points / self.edge).astype(np.int64)
         inside = (np.abs(cells) < _HALF).all(axis=1)
-        rows = np.column_stack([points, colours, np.ones(len(points))])[inside]
+        rows = np.column_stack([points, colors, np.ones(len(points))])[inside]
         spans = np.full((len(rows), 2), picture, dtype=np.int32)
         self._waiting.append(_summed(_pack(cells[inside]), rows, spans))
         if sum(len(keys) for keys, _, _ in self._waiting) > max(len(self._keys), 500_000):

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.config import Method
-from cohdc_train.slam.dynamics.dynamic_mask import DynamicMask
-from cohdc_train.slam.dynamics.free_space import Geometry, Reference
+from cohdc_train.slam.dynamics.dynamic_mask import DynamicMaskEstimator
+from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker, Reference
 from cohdc_train.slam.dynamics.motion_segmentation import moving_group, pose_of_rest
-from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, exp_se3
@@ -22,13 +22,13 @@ from cohdc_train.slam.io.live import Live
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.pose import optimize_pose
-from cohdc_train.slam.optimization.reprojection import Observations, Weighing
+from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel
 from cohdc_train.slam.runner import play
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
 
-WEIGHING = Weighing(CAMERA)
+REPROJECTION = ReprojectionModel(CAMERA)
 LENS = replace(CAMERA, k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)
 STILL = np.eye(4)
 Depth = NDArray[np.float32]
@@ -46,7 +46,7 @@ def with_box(image: Depth, left: int, depth: float) -> Depth:
 
 
 def found(camera: Camera, now: Depth, before: list[Depth], T_cw: Array = STILL) -> NDArray[np.bool_]:
-    geometry = Geometry(camera)
+    geometry = FreeSpaceChecker(camera)
     comparison = geometry.compare(now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before])
     return geometry.fine(geometry.movers(comparison))
 
@@ -84,18 +84,18 @@ def boxes(*lefts: int) -> NDArray[np.bool_]:
 
 
 def test_a_masked_thing_that_has_stood_still_is_told_from_one_that_came() -> None:
-    before, geometry = with_box(wall(), 30, 1.5), Geometry(CAMERA)
+    before, geometry = with_box(wall(), 30, 1.5), FreeSpaceChecker(CAMERA)
     now = with_box(before, 200, 1.5)
     references = [Reference(STILL, geometry.nearest(before))] * 3
-    rests = geometry.at_rest(boxes(30, 200), geometry.compare(now, STILL, references))
+    rests = geometry.static_components(boxes(30, 200), geometry.compare(now, STILL, references))
     np.testing.assert_array_equal(rests, boxes(30))
     blind = geometry.compare(np.zeros_like(now), STILL, references)
-    assert not geometry.at_rest(boxes(30, 200), blind).any(), "no depth, no verdict"
+    assert not geometry.static_components(boxes(30, 200), blind).any(), "no depth, no verdict"
 
 
 def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
-    geometry, box = Geometry(CAMERA), with_box(wall(), 30, 1.5)
-    masks = DynamicMask(geometry)
+    geometry, box = FreeSpaceChecker(CAMERA), with_box(wall(), 30, 1.5)
+    masks = DynamicMaskEstimator(geometry)
     seen = [keyframe(0, 10.0, geometry.nearest(box)), keyframe(1, 10.5, geometry.nearest(box))]
 
     def mask_at(t: float, depth: Depth) -> NDArray[np.bool_] | None:
@@ -112,7 +112,7 @@ def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
 
 
 def keyframe(index: int, t: float, nearest: Depth) -> Keyframe:
-    nothing = FeatureExtractor(CAMERA, 10)(np.zeros((240, 320, 3), np.uint8), wall())
+    nothing = OrbExtractor(CAMERA, 10)(np.zeros((240, 320, 3), np.uint8), wall())
     return Keyframe(index, t, STILL, nothing, np.zeros(0, dtype=np.int64), np.zeros((30, 40), np.float32), nearest)
 
 
@@ -122,13 +122,13 @@ def test_who_is_at_rest_is_of_use_to_tracking_but_stays_masked_to_watchers(tmp_p
     frames = [(rgb, depth, index / 5) for index, (rgb, depth, _) in enumerate(views)]
     tracker, seen = Tracker(CAMERA, features=500), []
 
-    def watcher(view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+    def observer(view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
         assert mask is not None
         assert tracker.mask is not None
         board = views[round(5 * view.t)][2]
         seen.append((mask[board].mean(), tracker.mask[board].mean()))
 
-    play(tracker, Live(CAMERA, frames), lambda view: views[round(5 * view.t)][2], tmp_path / "pictures", [watcher])
+    play(tracker, Live(CAMERA, frames), lambda view: views[round(5 * view.t)][2], tmp_path / "pictures", [observer])
     assert seen[0] == (1, 1)
     assert seen[-1] == (1, 0)
 
@@ -137,7 +137,7 @@ def test_the_camera_may_move() -> None:
     """Two views of the still room 20 cm apart: nothing moves; with a wrong pose something would seem to."""
     path = camera_path(40)
     first, second = (render(room(), path[k])[1] for k in (0, 15))
-    geometry = Geometry(CAMERA)
+    geometry = FreeSpaceChecker(CAMERA)
     references = [Reference(np.linalg.inv(path[0]), geometry.nearest(first))] * 2
     assert not geometry.movers(geometry.compare(second, np.linalg.inv(path[15]), references)).any()
 
@@ -165,7 +165,7 @@ def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
     found = 0
     for seed in range(200):
         points, seen, cart = scene(seed, 0.03)
-        moving = pose_of_rest(STILL, points, seen, WEIGHING, np.full(340, 9))[2]
+        moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(340, 9))[2]
         assert moving[~cart].mean() < 0.02
         found += moving[cart].mean() > 0.9
     assert found >= 198
@@ -174,10 +174,10 @@ def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
 @given(st.integers(0, 10_000), st.floats(0.035, 0.06))
 def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shift: float) -> None:
     points, seen, cart = scene(seed, shift)
-    dragged, inlier = optimize_pose(STILL, points, seen, WEIGHING)
+    dragged, inlier = optimize_pose(STILL, points, seen, REPROJECTION)
     assert np.linalg.norm(dragged[:3, 3]) > shift, "the cart takes the pose along, and further than it went"
     assert inlier[~cart].mean() > 0.8, "and no residual shows it"
-    pose, inlier, moving = pose_of_rest(STILL, points, seen, WEIGHING, np.full(340, 9))
+    pose, inlier, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(340, 9))
     assert moving[cart].mean() > 0.9
     assert moving[~cart].mean() < 0.02
     assert not (inlier & moving).any()
@@ -189,9 +189,9 @@ def test_nine_near_points_do_not_take_the_pose_along(seed: int, shift: float) ->
     """What a mask has missed of a passer-by, before 300 far points that agree with a pose wrong by centimetres."""
     points, seen, cart = scene(seed, shift)
     points, seen, cart = points[:309], seen.take(np.arange(309)), cart[:309]
-    dragged, _ = optimize_pose(STILL, points, seen, WEIGHING)
+    dragged, _ = optimize_pose(STILL, points, seen, REPROJECTION)
     assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift
-    pose, _, moving = pose_of_rest(STILL, points, seen, WEIGHING, np.full(309, 9))
+    pose, _, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(309, 9))
     assert moving[cart].mean() > 0.8
     assert np.linalg.norm(pose[:3, 3]) < 0.015
 
@@ -199,8 +199,8 @@ def test_nine_near_points_do_not_take_the_pose_along(seed: int, shift: float) ->
 @given(st.integers(0, 10_000))
 def test_a_world_that_stands_still_has_no_group_that_moves(seed: int) -> None:
     points, seen, _ = scene(seed, 0.0)
-    pose, _ = optimize_pose(STILL, points, seen, WEIGHING)
-    assert not moving_group(pose, points, seen, WEIGHING, np.full(340, 9)).any()
+    pose, _ = optimize_pose(STILL, points, seen, REPROJECTION)
+    assert not moving_group(pose, points, seen, REPROJECTION, np.full(340, 9)).any()
 
 
 @given(st.integers(0, 10_000), st.floats(0.06, 0.09))
@@ -213,18 +213,18 @@ def test_of_two_groups_the_one_that_is_long_known_is_the_world(seed: int, shift:
     local = points + walks[:, None] * np.array([shift, 0, 0])
     pixels = CAMERA.project(local) + rng.normal(0, 0.5, (400, 2))
     seen = Observations(pixels, local[:, 2] + rng.normal(0, 0.003, 400) * local[:, 2] ** 2, np.ones(400), np.ones(400))
-    dragged, _ = optimize_pose(STILL, points, seen, WEIGHING)
+    dragged, _ = optimize_pose(STILL, points, seen, REPROJECTION)
     assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift, "most points are the person's"
-    pose, _, moving = pose_of_rest(STILL, points, seen, WEIGHING, np.where(walks, 5, 100))
+    pose, _, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.where(walks, 5, 100))
     assert np.linalg.norm(pose[:3, 3]) < 0.5 * shift
     assert moving[walks].mean() > 0.9
-    followed, _, _ = pose_of_rest(STILL, points, seen, WEIGHING, np.full(400, 5))
+    followed, _, _ = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(400, 5))
     assert np.linalg.norm(followed[:3, 3]) > 0.5 * shift, "of points that are as long known the most are the world"
 
 
 def test_few_points_are_not_judged() -> None:
     points, seen, _ = scene(0, 0.02)
-    assert not moving_group(STILL, points[-20:], seen.take(np.arange(320, 340)), WEIGHING, np.full(20, 9)).any()
+    assert not moving_group(STILL, points[-20:], seen.take(np.arange(320, 340)), REPROJECTION, np.full(20, 9)).any()
 
 
 def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() -> None:
@@ -232,13 +232,13 @@ def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() 
     np.testing.assert_array_equal(world.trust(ids), 1)
     weights = []
     for _ in range(5):
-        world.judge(still=ids[1:], moving=ids[:1])
+        world.update_static_odds(still=ids[1:], moving=ids[:1])
         weights.append(world.trust(ids)[0])
     assert weights == sorted(weights, reverse=True)
     assert weights[-1] < 0.02
     assert world.trust(ids)[1] == 1
     for _ in range(100):
-        world.judge(still=ids, moving=ids[:0])
+        world.update_static_odds(still=ids, moving=ids[:0])
     np.testing.assert_array_equal(world.trust(ids), 1)
 
 
@@ -248,7 +248,7 @@ def test_what_is_known_of_a_duplicate_stays_known_when_it_is_joined() -> None:
     tracker.track(*render(room(), STILL)[:2], 0.0)
     world = tracker.map
     for moving in ([7, 12], [12]):
-        world.judge(still=np.zeros(0, dtype=np.int64), moving=np.array(moving))
+        world.update_static_odds(still=np.zeros(0, dtype=np.int64), moving=np.array(moving))
     caught = world.trust(np.array([7, 12]))
     assert caught[1] < caught[0] < 1
     world.replace(np.array([7, 9, 11]), np.array([3, 12, 3]), world.keyframes)
@@ -260,7 +260,7 @@ def test_depth_that_comes_late_is_carried_back() -> None:
     lag = np.linalg.inv(exp_se3(np.array([0.01, 0.0, 0.03, 0.0, 0.02, 0.0])))
     rgb, depth, _ = render(room()[:1], STILL)
     late = render(room()[:1], np.linalg.inv(lag))[1]
-    extract = FeatureExtractor(CAMERA, 300)
+    extract = OrbExtractor(CAMERA, 300)
     truth, told, untold = (extract(rgb, *rest).depths for rest in ((depth,), (late, None, lag), (late,)))
     assert np.nanmax(np.abs(told - truth)) < 0.002
     assert np.nanmedian(np.abs(untold - truth)) > 0.02

@@ -15,13 +15,13 @@ _SHIRT = texture(np.random.default_rng(2), 100, 80, patches=200)
 
 def scene(left: int, depth: float = PERSON) -> tuple[Half, Mask]:
     """A textured board, 80 x 100 px, its left edge at `left`, before a wall. Returns the frame and the true mask."""
-    rgb, metres = _WALLPAPER.copy(), np.full((HEIGHT, WIDTH), WALL, dtype=np.float32)
+    rgb, meters = _WALLPAPER.copy(), np.full((HEIGHT, WIDTH), WALL, dtype=np.float32)
     mask = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
     begin, end = max(left, 0), min(left + 80, WIDTH)
     rgb[70:170, begin:end] = _SHIRT[:, begin - left : end - left]
-    metres[70:170, begin:end] = depth
+    meters[70:170, begin:end] = depth
     mask[70:170, begin:end] = True
-    return halve(rgb, metres), halve_mask(mask)
+    return halve(rgb, meters), halve_mask(mask)
 
 
 def iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:

@@ -12,7 +12,7 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cohdc_train.slam.dynamics.moving_surfaces import JUMP, Bits, Movers, surfaces
+from cohdc_train.slam.dynamics.moving_surfaces import JUMP, Bits, MovingSurfaceTracker, surfaces
 from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
@@ -39,16 +39,16 @@ def scene(person: Bits = PERSON, depth: float = 1.0) -> NDArray[np.float32]:
 
 
 def test_of_a_surface_that_is_found_by_half_all_moves_and_nothing_else() -> None:
-    np.testing.assert_array_equal(Movers().whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
+    np.testing.assert_array_equal(MovingSurfaceTracker().whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
 
 
 def test_of_one_that_is_found_by_less_or_was_just_seen_there_only_that_moves() -> None:
-    np.testing.assert_array_equal(Movers().whole(0.0, THIRD, NOWHERE, NOWHERE, scene(), NOWHERE), THIRD)
-    np.testing.assert_array_equal(Movers().whole(0.0, HALF, HALF, NOWHERE, scene(), NOWHERE), HALF)
+    np.testing.assert_array_equal(MovingSurfaceTracker().whole(0.0, THIRD, NOWHERE, NOWHERE, scene(), NOWHERE), THIRD)
+    np.testing.assert_array_equal(MovingSurfaceTracker().whole(0.0, HALF, HALF, NOWHERE, scene(), NOWHERE), HALF)
 
 
 def test_what_moved_goes_on_though_nothing_finds_it_until_it_was_seen_at_rest() -> None:
-    movers = Movers()
+    movers = MovingSurfaceTracker()
     movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
     for step in range(1, 6):
         image = scene(np.roll(PERSON, step, axis=1), 1.0 - 0.1 * step)
@@ -60,7 +60,7 @@ def test_what_moved_goes_on_though_nothing_finds_it_until_it_was_seen_at_rest() 
 
 
 def test_what_nothing_finds_nor_masks_goes_on_for_half_a_second() -> None:
-    movers, trace = Movers(), block(slice(10, 12), slice(10, 14))
+    movers, trace = MovingSurfaceTracker(), block(slice(10, 12), slice(10, 14))
     movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
     for t in (0.4, 0.8, 1.2):
         np.testing.assert_array_equal(movers.whole(t, trace, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON)
@@ -69,27 +69,27 @@ def test_what_nothing_finds_nor_masks_goes_on_for_half_a_second() -> None:
 
 
 def test_a_frame_without_depth_says_nothing() -> None:
-    movers = Movers()
+    movers = MovingSurfaceTracker()
     movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
     assert not movers.whole(0.1, NOWHERE, NOWHERE, NOWHERE, scene() * 0, NOWHERE).any()
     np.testing.assert_array_equal(movers.whole(0.2, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON)
 
 
 def test_a_mask_of_one_frame_is_not_remembered() -> None:
-    movers, wall = Movers(), block(slice(0, 30), slice(5, 35))
+    movers, wall = MovingSurfaceTracker(), block(slice(0, 30), slice(5, 35))
     movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE)
     movers.whole(0.1, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), wall)
     assert not movers.whole(0.2, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE).any()
 
 
 def test_who_comes_after_in_the_same_place_does_not_move_for_it() -> None:
-    movers = Movers()
+    movers = MovingSurfaceTracker()
     movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
     assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(depth=1.0 + 2 * JUMP), NOWHERE).any()
 
 
 def test_whom_a_mask_covered_goes_on_where_the_next_one_misses_him() -> None:
-    movers, wide = Movers(), block(slice(7, 28), slice(7, 23))
+    movers, wide = MovingSurfaceTracker(), block(slice(7, 28), slice(7, 23))
     assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), wide).any(), "he is in the mask already"
     np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), PERSON & ~THIRD)
     np.testing.assert_array_equal(movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON)
@@ -97,7 +97,7 @@ def test_whom_a_mask_covered_goes_on_where_the_next_one_misses_him() -> None:
 
 def test_a_wall_that_comes_out_from_under_the_edge_of_a_mask_stands_still() -> None:
     """Between the picture's edge and somebody who walks away from it; masks reach 3 px beyond him."""
-    movers = Movers()
+    movers = MovingSurfaceTracker()
     for step in range(12):
         person, wide = (block(slice(0, 30), slice(max(step - more, 0), step + 10 + more)) for more in (0, 3))
         assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(person), wide).any()
@@ -107,11 +107,13 @@ def test_a_floor_is_no_part_of_who_is_masked_on_it() -> None:
     floor = block(slice(25, 28), slice(0, 40))
     found = PERSON | block(slice(25, 28), slice(0, 10))
     wanted = found & ~PERSON
-    np.testing.assert_array_equal(Movers().whole(0.0, found, NOWHERE, NOWHERE, scene(PERSON | floor), PERSON), wanted)
+    np.testing.assert_array_equal(
+        MovingSurfaceTracker().whole(0.0, found, NOWHERE, NOWHERE, scene(PERSON | floor), PERSON), wanted
+    )
 
 
 def test_what_is_forgotten_moves_no_longer() -> None:
-    movers = Movers()
+    movers = MovingSurfaceTracker()
     movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
     movers.forget()
     assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
@@ -119,7 +121,7 @@ def test_what_is_forgotten_moves_no_longer() -> None:
 
 def test_the_floor_that_feet_stand_on_is_not_taken_along() -> None:
     """A floor joins the person; a keyframe of half a second ago has seen most of it, but not what comes into view."""
-    movers, floor = Movers(), block(slice(25, 28), slice(0, 40))
+    movers, floor = MovingSurfaceTracker(), block(slice(25, 28), slice(0, 40))
     movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
     image = scene(PERSON | floor)
     seen = floor.copy()
@@ -128,13 +130,17 @@ def test_the_floor_that_feet_stand_on_is_not_taken_along() -> None:
 
 
 def test_where_everything_seems_to_move_the_pose_is_wrong_and_nothing_does() -> None:
-    movers = Movers()
+    movers = MovingSurfaceTracker()
     assert not movers.whole(0.0, EVERYWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
     assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any(), "nor later"
 
 
 def test_where_nothing_is_known_nothing_moves() -> None:
-    assert not Movers().whole(0.0, NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32), NOWHERE).any()
+    assert (
+        not MovingSurfaceTracker()
+        .whole(0.0, NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32), NOWHERE)
+        .any()
+    )
 
 
 @given(
@@ -184,8 +190,8 @@ def test_who_comes_up_to_the_camera_does_not_take_it_along() -> None:
 @pytest.mark.parametrize("frames", [1, 4])
 def test_a_false_mask_does_not_lose_a_robot_that_turns(frames: int) -> None:
     """In a round room, whose wall is one surface of which no keyframe is two seconds old, at 45 degrees a second."""
-    rng, corners = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 17)
-    places = 2 * np.stack([np.sin(corners), -np.ones(17), np.cos(corners)], axis=1)
+    rng, keypoints = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 17)
+    places = 2 * np.stack([np.sin(keypoints), -np.ones(17), np.cos(keypoints)], axis=1)
     wall = [Rectangle(a, b - a, np.array([0, 4.0, 0]), texture(rng, 800, 200, 500)) for a, b in pairwise(places)]
     tracker, most = Tracker(CAMERA, features=500), np.zeros((240, 320), dtype=np.bool_)
     most[:, 40:280] = True

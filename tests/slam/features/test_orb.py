@@ -16,14 +16,14 @@ from cohdc_train.slam.features.depth_sampling import sample_depth
 from cohdc_train.slam.features.descriptors import hamming
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import match_descriptors
-from cohdc_train.slam.features.orb import FeatureExtractor, spread
+from cohdc_train.slam.features.orb import OrbExtractor, spread
 
 
 def test_the_mask_costs_no_budget() -> None:
     rgb, depth, _ = render(room(), np.eye(4))
     mask = np.zeros((240, 320), dtype=np.bool_)
     mask[:, :150] = True
-    extract = FeatureExtractor(CAMERA, budget=300)
+    extract = OrbExtractor(CAMERA, budget=300)
     features, unmasked = extract(rgb, depth, mask), extract(rgb, depth)
     columns, rows = np.rint(features.pixels).astype(int).T
     assert not mask[rows, columns].any()
@@ -51,7 +51,7 @@ def test_no_earlier_frame_decides_which_corners_are_chosen() -> None:
     squares = np.kron(tiles, np.ones((16, 16)))  # corners of two grey levels: responses are alike
     rgb = np.repeat((80 + 90 * squares)[..., None], 3, axis=2).astype(np.uint8)
     depth = np.full((240, 320), 2.0, dtype=np.float32)
-    fresh, used = FeatureExtractor(CAMERA, 100), FeatureExtractor(CAMERA, 100)
+    fresh, used = OrbExtractor(CAMERA, 100), OrbExtractor(CAMERA, 100)
     used(np.full_like(rgb, 90), depth)  # a picture without corners: the next one is sought with the lowest threshold
     first, second = fresh(rgb, depth), used(rgb, depth)
     np.testing.assert_array_equal(first.pixels, second.pixels)
@@ -176,5 +176,5 @@ def test_mutually_nearest_descriptors_are_those_of_a_search_through_all() -> Non
     bits = hamming(there[:, None], here)
     nearest = (bits == bits.min(axis=0)) & (bits == bits.min(axis=1, keepdims=True)) & (bits <= 60)
     pairs = {(100 + i, j) for i, j in np.argwhere(nearest).tolist()}
-    assert set(zip(matches.points.tolist(), matches.corners.tolist(), strict=True)) == pairs
+    assert set(zip(matches.points.tolist(), matches.keypoints.tolist(), strict=True)) == pairs
     assert len(pairs) == 25

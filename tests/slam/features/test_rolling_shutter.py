@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from plane_world import CAMERA, features_at
 
 from cohdc_train.slam.features.keypoints import Features
-from cohdc_train.slam.features.rolling_shutter import unrolled
+from cohdc_train.slam.features.rolling_shutter import undo_rolling_shutter
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 
 ROLLING = replace(CAMERA, readout=0.02)
@@ -32,10 +32,10 @@ def test_corners_are_where_the_middle_row_s_moment_has_them(speed: list[float]) 
     points = np.random.default_rng(0).uniform([-0.8, -0.6, 1.5], [0.8, 0.6, 3.0], (30, 3))
     twist = np.array(speed)
     measured = seen(points, twist)
-    result = unrolled(measured, ROLLING, twist)
+    result = undo_rolling_shutter(measured, ROLLING, twist)
     np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.03)
     np.testing.assert_allclose(result.depths, points[:, 2], atol=3e-4)
-    np.testing.assert_array_equal(unrolled(measured, CAMERA, twist).points, measured.points)
+    np.testing.assert_array_equal(undo_rolling_shutter(measured, CAMERA, twist).points, measured.points)
 
 
 def test_a_corner_without_depth_moves_like_the_others() -> None:
@@ -43,8 +43,8 @@ def test_a_corner_without_depth_moves_like_the_others() -> None:
     twist = np.array([0.5, 0.3, 0.0, 0.1, 0.6, 0.2])
     measured = seen(points, twist)
     blind = replace(measured, depths=np.where(np.arange(30) % 3 == 0, np.nan, measured.depths))
-    result = unrolled(blind, ROLLING, twist)
+    result = undo_rolling_shutter(blind, ROLLING, twist)
     assert np.isnan(result.depths).sum() == 10
     np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.1)
     nothing = replace(measured, depths=np.full(30, np.nan))
-    np.testing.assert_array_equal(unrolled(nothing, ROLLING, twist).points, measured.points)
+    np.testing.assert_array_equal(undo_rolling_shutter(nothing, ROLLING, twist).points, measured.points)

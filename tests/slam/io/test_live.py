@@ -151,8 +151,8 @@ def test_a_first_image_that_does_not_fit_the_camera_is_an_error(recorded: Path, 
 
 
 def test_the_nearest_partner_is_taken_once(tmp_path: Path) -> None:
-    colour, depth = [0.0, 0.033, 0.066, 0.100], [0.004, 0.030, 0.031, 0.085, 0.119]
-    for name, stamps in (("rgb.txt", colour), ("depth.txt", depth)):
+    color, depth = [0.0, 0.033, 0.066, 0.100], [0.004, 0.030, 0.031, 0.085, 0.119]
+    for name, stamps in (("rgb.txt", color), ("depth.txt", depth)):
         (tmp_path / name).write_text("".join(f"{t:.3f} {t:.3f}.dat\n" for t in stamps))
         for t in stamps:
             (tmp_path / f"{t:.3f}.dat").write_bytes(b"anything")
@@ -180,7 +180,7 @@ def test_a_camera_of_ones_own(tmp_path: Path) -> None:
         Live(CAMERA, frames(FRAMES)),
         out=tmp_path / "run",
         features=400,
-        watchers=[lambda view, mask, record, tracker: seen.append((view.t, record.pose.tracked, mask))],
+        observers=[lambda view, mask, record, tracker: seen.append((view.t, record.pose.tracked, mask))],
     )
     assert metrics["coverage"] == 1.0
     assert [row[0] for row in seen] == [index / 30 for index in range(FRAMES)]
@@ -210,10 +210,10 @@ class RealSense(ModuleType):
             rgb, depth, t = next(coming)
         except StopIteration:
             raise DataError("the camera was unplugged") from None
-        colour = SimpleNamespace(get_data=lambda: rgb)
+        color = SimpleNamespace(get_data=lambda: rgb)
         units = SimpleNamespace(get_data=lambda: np.nan_to_num(1000 * depth).astype(np.uint16))
         times = {"get_timestamp": lambda: 1000 * t}
-        return SimpleNamespace(get_color_frame=lambda: colour, get_depth_frame=lambda: units, **times)
+        return SimpleNamespace(get_color_frame=lambda: color, get_depth_frame=lambda: units, **times)
 
 
 def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,7 +262,7 @@ def test_ctrl_c_ends_a_live_run_after_the_frame(tmp_path: Path, capsys: pytest.C
         if len(seen) == 3:
             signal.raise_signal(signal.SIGINT)
 
-    metrics = run_source(Live(CAMERA, frames(1000)), out=tmp_path / "run", features=400, watchers=[interrupt])
+    metrics = run_source(Live(CAMERA, frames(1000)), out=tmp_path / "run", features=400, observers=[interrupt])
     assert metrics["frames"] == len(seen) == 3
     assert "stopping; Ctrl-C again" in capsys.readouterr().err
     assert (tmp_path / "run" / "trajectory.txt").exists()
@@ -278,5 +278,5 @@ def test_ctrl_c_ends_the_wait_for_more(recorded: Path, tmp_path: Path) -> None:
             threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     source = Followed(recorded, CAMERA, rgbd_layout(CAMERA), idle=600)
-    metrics = run_source(source, out=tmp_path / "run", features=400, watchers=[interrupt_later])
+    metrics = run_source(source, out=tmp_path / "run", features=400, observers=[interrupt_later])
     assert metrics["frames"] == FRAMES

@@ -51,16 +51,16 @@ def test_colour_encodings(rgb: NDArray[np.uint8], padding: int) -> None:
     }
     for encoding, pixels in messages.items():
         np.testing.assert_array_equal(rgb_of(image(encoding, pixels, padding)), rgb, err_msg=encoding)
-    grey = rgb_of(image("mono8", rgb[..., 0], padding))
-    np.testing.assert_array_equal(grey, np.repeat(rgb[..., :1], 3, axis=2))
+    gray = rgb_of(image("mono8", rgb[..., 0], padding))
+    np.testing.assert_array_equal(gray, np.repeat(rgb[..., :1], 3, axis=2))
 
 
 @pytest.mark.parametrize("big", [False, True])
 def test_depth_encodings(big: bool) -> None:
-    metres = np.array([[0.0, 1.234, 2.5], [np.nan, np.inf, 4.0]], np.float32)
+    meters = np.array([[0.0, 1.234, 2.5], [np.nan, np.inf, 4.0]], np.float32)
     millimetres = np.array([[0, 1234, 2500], [0, 0, 4000]], np.uint16)
     expected = np.array([[0, 1.234, 2.5], [0, 0, 4]], np.float32)
-    for message in (image("32FC1", metres, 8, big), image("16UC1", millimetres, 2, big)):
+    for message in (image("32FC1", meters, 8, big), image("16UC1", millimetres, 2, big)):
         depth = depth_of(message)
         assert depth.dtype == np.float32
         np.testing.assert_allclose(depth, expected, rtol=1e-6)
@@ -180,9 +180,9 @@ def drive(node: Any) -> None:
     node.publishers["pose"].publish = lambda m: (node.publishers["pose"].sent.append(m), answered.set())
     for index, T_wc in enumerate(camera_path(FRAMES)):
         rgb, depth, _ = render(room(), T_wc)
-        colour = image("bgr8", rgb[..., ::-1])
-        colour.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=index * 33_000_000), frame_id="optical")
-        node._pairs.callback(colour, image("16UC1", (depth * 1000).astype(np.uint16)))
+        color = image("bgr8", rgb[..., ::-1])
+        color.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=index * 33_000_000), frame_id="optical")
+        node._pairs.callback(color, image("16UC1", (depth * 1000).astype(np.uint16)))
         assert answered.wait(20)
         answered.clear()
     os.kill(os.getpid(), signal.SIGINT)
@@ -239,9 +239,9 @@ def test_the_newest_frame_replaces_the_one_that_waits(ros: ModuleType, monkeypat
     monkeypatch.setattr(ros, "WAIT", 0.01)
     node = ros.SlamNode()
     for second in (1, 2, 3):
-        colour = image("rgb8", np.full((2, 2, 3), second, np.uint8))
-        colour.header = SimpleNamespace(stamp=SimpleNamespace(sec=second, nanosec=0))
-        node._take(colour, image("32FC1", np.ones((2, 2), np.float32)))
+        color = image("rgb8", np.full((2, 2, 3), second, np.uint8))
+        color.header = SimpleNamespace(stamp=SimpleNamespace(sec=second, nanosec=0))
+        node._take(color, image("32FC1", np.ones((2, 2), np.float32)))
     frames = node.frames()
     first = next(frames)
     assert first is not None

@@ -56,9 +56,9 @@ def test_a_missing_list_is_named(tmp_path: Path) -> None:
 
 
 def test_images_are_read_in_their_units(tmp_path: Path) -> None:
-    colour = np.zeros((240, 320, 3), dtype=np.uint8)
-    colour[..., 2] = 200  # red, as OpenCV orders it
-    cv2.imwrite(str(tmp_path / "c.png"), colour)
+    color = np.zeros((240, 320, 3), dtype=np.uint8)
+    color[..., 2] = 200  # red, as OpenCV orders it
+    cv2.imwrite(str(tmp_path / "c.png"), color)
     cv2.imwrite(str(tmp_path / "d.png"), np.full((240, 320), 7500, dtype=np.uint16))
     cv2.imwrite(str(tmp_path / "m.png"), np.full((240, 320), 1, dtype=np.uint8))
     assert read_rgb(tmp_path / "c.png", CAMERA)[0, 0].tolist() == [200, 0, 0]

@@ -9,13 +9,13 @@ from plane_world import CAMERA
 
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.frame import Pose
-from cohdc_train.slam.geometry.depth_image import Picture, take_picture
+from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
-from cohdc_train.slam.loop_closing.verification import Loop, Verifier
+from cohdc_train.slam.loop_closing.verification import Loop, LoopVerifier
 from cohdc_train.slam.mapping.global_bundle_adjustment import adjust_everything
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.reprojection import Weighing, chi_square
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel, chi_square
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
@@ -77,29 +77,31 @@ def test_both_ends_of_a_loop_share_points(closed: Run) -> None:
     seen = [keyframe.seen_points() for keyframe in world.keyframes]
     assert all(len(ids) == len(np.unique(ids)) for ids in seen), "a keyframe sees a point once"
     counts = np.bincount(np.concatenate(seen), minlength=world.size)
-    np.testing.assert_array_equal(world.seen_by[: world.size], counts)
+    np.testing.assert_array_equal(world.num_observations[: world.size], counts)
 
 
 def left_over(world: Map) -> float:
     """Mean of all measurements' squared residuals, in sigmas, each held to be 10 at most."""
     squares = []
     for keyframe in world.keyframes:
-        corners = np.flatnonzero(keyframe.point_ids >= 0)
-        seen = observations(keyframe.features, corners)
-        squares.append(chi_square(keyframe.T_cw, world.positions[keyframe.point_ids[corners]], seen, Weighing(CAMERA)))
+        keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+        seen = observations(keyframe.features, keypoints)
+        squares.append(
+            chi_square(keyframe.T_cw, world.positions[keyframe.point_ids[keypoints]], seen, ReprojectionModel(CAMERA))
+        )
     return float(np.minimum(np.concatenate(squares), 10.0).mean())
 
 
 def test_adjusting_everything_brings_displaced_keyframes_back(closed: Run) -> None:
     """By more than half, and to where what is left over is no larger than before, within a twentieth."""
     world = copy.deepcopy(closed[0].map)
-    adjust_everything(world, Weighing(CAMERA))
+    adjust_everything(world, ReprojectionModel(CAMERA))
     settled, best = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
     rng = np.random.default_rng(0)
     for keyframe in world.keyframes[1:]:
         keyframe.T_cw = exp_se3(0.002 * rng.standard_normal(6)) @ keyframe.T_cw
     displaced, worst = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
-    adjust_everything(world, Weighing(CAMERA))
+    adjust_everything(world, ReprojectionModel(CAMERA))
     again = np.stack([keyframe.T_cw for keyframe in world.keyframes])
     np.testing.assert_array_equal(again[0], settled[0])
     assert np.abs(again - settled).mean() < 0.5 * np.abs(displaced - settled).mean()
@@ -129,16 +131,16 @@ class TestVerification:
     """The newest keyframe of the drifting run, which has come back to where the first ones were taken."""
 
     @pytest.fixture
-    def pictures(self, views: list[View], drifting: Run) -> dict[int, Picture]:
-        return {k.index: take_picture(*views[frame(k)], None, CAMERA) for k in drifting[0].map.keyframes}
+    def pictures(self, views: list[View], drifting: Run) -> dict[int, DepthImage]:
+        return {k.index: make_depth_image(*views[frame(k)], None, CAMERA) for k in drifting[0].map.keyframes}
 
-    def verify(self, tracker: Tracker, pictures: dict[int, Picture]) -> Loop | None:
+    def verify(self, tracker: Tracker, pictures: dict[int, DepthImage]) -> Loop | None:
         newest = tracker.map.keyframes[-1]
         there = np.linalg.norm(TRUTH[:, :3, 3] - TRUTH[frame(newest), :3, 3], axis=1)
         old = min(tracker.map.keyframes[:20], key=lambda k: float(there[frame(k)]))
-        return Verifier(tracker.map, Weighing(CAMERA), np.random.default_rng(0))(newest, old, pictures)
+        return LoopVerifier(tracker.map, ReprojectionModel(CAMERA), np.random.default_rng(0))(newest, old, pictures)
 
-    def test_gives_the_true_motion_not_the_drifted_one(self, drifting: Run, pictures: dict[int, Picture]) -> None:
+    def test_gives_the_true_motion_not_the_drifted_one(self, drifting: Run, pictures: dict[int, DepthImage]) -> None:
         tracker = drifting[0]
         loop = self.verify(tracker, pictures)
         assert loop is not None
@@ -151,7 +153,7 @@ class TestVerification:
             assert off < 0.02
             assert off < 0.3 * np.linalg.norm((new.T_cw @ inverse(old.T_cw) @ inverse(truth))[:3, 3])
 
-    def test_neighbours_that_contradict_refuse_it(self, drifting: Run, pictures: dict[int, Picture]) -> None:
+    def test_neighbours_that_contradict_refuse_it(self, drifting: Run, pictures: dict[int, DepthImage]) -> None:
         keyframes = drifting[0].map.keyframes[-6:-1]
         before = [keyframe.T_cw for keyframe in keyframes]
         for keyframe in keyframes:
@@ -162,7 +164,7 @@ class TestVerification:
             for keyframe, T_cw in zip(keyframes, before, strict=True):
                 keyframe.T_cw = T_cw
 
-    def test_pictures_that_contradict_refuse_it(self, drifting: Run, pictures: dict[int, Picture]) -> None:
+    def test_pictures_that_contradict_refuse_it(self, drifting: Run, pictures: dict[int, DepthImage]) -> None:
         keyframes = drifting[0].map.keyframes
         wrong = pictures | {keyframes[-1].index: pictures[keyframes[len(keyframes) // 2].index]}
         assert self.verify(drifting[0], wrong) is None

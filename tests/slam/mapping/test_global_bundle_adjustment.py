@@ -11,11 +11,11 @@ from plane_world import CAMERA, camera_path, features_at, render, room
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
 from cohdc_train.slam.mapping import global_bundle_adjustment as final_adjustment
-from cohdc_train.slam.mapping.global_bundle_adjustment import SeenFrames, adjust_everything
+from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames, adjust_everything
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.reprojection import Weighing
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 from cohdc_train.slam.tracking.motion_model import FEW
 from cohdc_train.slam.tracking.tracker import Tracker
 
@@ -46,7 +46,7 @@ def off_after_adjustment(seed: int, frames_count: bool) -> float:
     sightings = [
         Sighting(inverse(T_wc), ids, observations(measured(T_wc, points, rng), ids)) for T_wc in PATH if frames_count
     ]
-    adjust_everything(world, Weighing(CAMERA), sightings)
+    adjust_everything(world, ReprojectionModel(CAMERA), sightings)
     return float(np.sqrt(((world.positions[ids] - points) ** 2).sum(axis=1).mean()))
 
 
@@ -69,7 +69,7 @@ def tracker() -> Tracker:
     return run()
 
 
-def remember(seen: SeenFrames, row: int, tracker: Tracker) -> None:
+def remember(seen: ObservedFrames, row: int, tracker: Tracker) -> None:
     """The tracker's latest frame, as one in that row of the log."""
     assert tracker._last is not None
     assert tracker.features is not None
@@ -80,7 +80,7 @@ def remember(seen: SeenFrames, row: int, tracker: Tracker) -> None:
 
 def test_memory_is_bounded_and_what_is_kept_lies_evenly(tracker: Tracker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(final_adjustment, "_MOST", 20)
-    seen = SeenFrames()
+    seen = ObservedFrames()
     for row in range(1000):
         remember(seen, row, tracker)
         assert len(seen._kept) <= 20
@@ -98,7 +98,7 @@ def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(m
     kept = [frame.row for frame in tracker._seen._kept]
     step, further = np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]), np.array([0.0, 0.03, 0.01, 0.0, 0.02, 0.0])
 
-    def moves(world: Map, weighing: Weighing, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
+    def moves(world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
         if not sightings:
             world.move(np.stack([k.T_cw for k in world.keyframes]) @ inverse(exp_se3(step)))
         poses = [exp_se3(further) @ sighting.T_cw for sighting in sightings]
@@ -122,7 +122,7 @@ def test_frames_give_all_their_points_between_them(
     """Each only half of them; of many, those that are left do so too."""
     monkeypatch.setattr(final_adjustment, "_MOST", 20)
     assert tracker._last is not None
-    points, seen = tracker._last.matches.points, SeenFrames()
+    points, seen = tracker._last.matches.points, ObservedFrames()
     for row in range(frames):
         remember(seen, row, tracker)
     for kept in seen._kept:
@@ -132,7 +132,7 @@ def test_frames_give_all_their_points_between_them(
 
 
 def test_a_frame_that_saw_little_is_not_kept(tracker: Tracker) -> None:
-    fit, seen = tracker._last, SeenFrames()
+    fit, seen = tracker._last, ObservedFrames()
     assert fit is not None
     for points, wanted in ((2 * FEW - 1, False), (2 * FEW, True)):
         few = replace(fit, matches=fit.matches.take(np.arange(points)))
@@ -140,14 +140,14 @@ def test_a_frame_that_saw_little_is_not_kept(tracker: Tracker) -> None:
 
 
 def test_a_row_that_a_younger_point_has_taken_says_nothing(tracker: Tracker) -> None:
-    seen = SeenFrames()
+    seen = ObservedFrames()
     remember(seen, 0, tracker)
     ids = seen._kept[0].ids
     taken = ids[:5]
-    before = tracker.map.born[taken].copy()
-    tracker.map.born[taken] += 1
+    before = tracker.map.first_keyframe[taken].copy()
+    tracker.map.first_keyframe[taken] += 1
     sighting = final_adjustment._sighting(seen._kept[0], np.eye(4), tracker.map)
-    tracker.map.born[taken] = before
+    tracker.map.first_keyframe[taken] = before
     assert set(sighting.ids.tolist()) == set(ids[5:].tolist())
     assert len(sighting.seen) == len(sighting.ids)
 
@@ -165,12 +165,12 @@ def test_a_map_of_one_keyframe_is_left_alone() -> None:
 def test_without_frames_the_keyframes_are_adjusted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker, asked = run(), []
 
-    def counts(world: object, weighing: object, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
+    def counts(world: object, reprojection: object, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
         asked.append(len(sightings))
         return np.zeros((0, 4, 4))
 
     monkeypatch.setattr(final_adjustment, "adjust_everything", counts)
-    tracker._seen = SeenFrames()
+    tracker._seen = ObservedFrames()
     before = tracker.trajectory()[1]
     tracker.finish()
     assert asked == [0]

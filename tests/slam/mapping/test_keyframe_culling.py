@@ -99,7 +99,7 @@ def test_the_books_are_right_after_many_removals(culled: Tracker) -> None:
     assert world.joined > len(world.keyframes)
     seen = [keyframe.seen_points() for keyframe in world.keyframes]
     counts = np.bincount(np.concatenate(seen), minlength=world.size)
-    np.testing.assert_array_equal(world.seen_by[: world.size], counts)
+    np.testing.assert_array_equal(world.num_observations[: world.size], counts)
     there = {keyframe.index for keyframe in world.keyframes}
     remembered = np.unique(world.observers[: world.size]) - 1
     assert set(remembered.tolist()) <= there | {-1}
@@ -113,18 +113,19 @@ def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Tracker) ->
     stamps, before = whole.trajectory()
     removed = cull_keyframes(world, world.keyframes[-1], set())
     assert removed
-    born = np.flatnonzero(
-        np.isin(world.born[: world.size], [k.index for k in removed]) & (world.seen_by[: world.size] > 0)
+    first_keyframe = np.flatnonzero(
+        np.isin(world.first_keyframe[: world.size], [k.index for k in removed])
+        & (world.num_observations[: world.size] > 0)
     )
-    assert len(born)
+    assert len(first_keyframe)
     np.testing.assert_allclose(whole.trajectory()[1], before, atol=1e-9)
     np.testing.assert_array_equal(whole.trajectory()[0], stamps)
-    maps, places = affine(world, born, T_cw), world.positions[born].copy()
+    maps, places = affine(world, first_keyframe, T_cw), world.positions[first_keyframe].copy()
     step = exp_se3(np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]))
     world.move(np.stack([k.T_cw for k in world.keyframes]) @ np.linalg.inv(step))  # as a loop moves it
-    np.testing.assert_allclose(world.positions[born], places @ step[:3, :3].T + step[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(world.positions[first_keyframe], places @ step[:3, :3].T + step[:3, 3], atol=1e-9)
     np.testing.assert_allclose(whole.trajectory()[1], step @ before, atol=1e-9)
-    np.testing.assert_allclose(affine(world, born, T_cw @ np.linalg.inv(step)), maps, atol=1e-9)
+    np.testing.assert_allclose(affine(world, first_keyframe, T_cw @ np.linalg.inv(step)), maps, atol=1e-9)
 
 
 def test_some_keyframes_never_go(whole: Tracker) -> None:
@@ -152,7 +153,7 @@ def test_a_window_under_way_moves_no_point_that_took_a_row_meanwhile(whole: Trac
     world.add_points(later, np.flatnonzero(features.depths > 0)[:20])
     assert set(later.seen_points()) & set(gone.tolist())
     before: Array = world.positions[later.seen_points()].copy()
-    good = np.ones(len(window.corners), dtype=np.bool_)
+    good = np.ones(len(window.keypoints), dtype=np.bool_)
     close_window(world, window, Solution(np.stack(window.poses), window.points + 0.5, good))
     np.testing.assert_allclose(world.positions[later.seen_points()], before, atol=1e-9)
 

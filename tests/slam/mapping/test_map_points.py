@@ -47,9 +47,9 @@ def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
     world.add_points(second, np.array([YOUNG]))
     world.visible[[TWICE, RARELY_FOUND]], world.found[[TWICE, RARELY_FOUND]] = 20, (5, 4)
     cull(world, newest=2)
-    assert world.seen_by[: world.size].tolist() == [1, 2, 0, 1], "its time is not up"
+    assert world.num_observations[: world.size].tolist() == [1, 2, 0, 1], "its time is not up"
     cull(world, newest=3)
-    assert world.seen_by[: world.size].tolist() == [0, 2, 0, 1]
+    assert world.num_observations[: world.size].tolist() == [0, 2, 0, 1]
     assert first.point_ids.tolist() == [-1, TWICE, -1, -1]
 
 
@@ -61,13 +61,13 @@ def test_dropped_point_leaves_every_keyframe_however_many_saw_it() -> None:
     world.add_points(keyframes[0], np.array([0]))
     for other in keyframes[1:]:
         world.add_keyframe(other)
-    assert world.seen_by[0] == 12
+    assert world.num_observations[0] == 12
     drop_points(world, np.array([0]))
-    assert world.seen_by[0] == 0
+    assert world.num_observations[0] == 0
     assert all(other.point_ids[0] == -1 for other in keyframes)
 
 
 def test_grown_map_has_no_merged_points_in_its_new_rows() -> None:
     world = Map(CAMERA)
     world._reserve(3000)
-    np.testing.assert_array_equal(world.became, -1)
+    np.testing.assert_array_equal(world.merged_into, -1)

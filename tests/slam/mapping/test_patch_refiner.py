@@ -11,16 +11,16 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import FeatureExtractor, gray_of
+from cohdc_train.slam.features.orb import OrbExtractor, gray_of
 from cohdc_train.slam.features.patch_alignment import Pyramid, align, warped
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, to_local
 from cohdc_train.slam.mapping.keyframe import observations
-from cohdc_train.slam.mapping.patch_refiner import Refiner, affine
+from cohdc_train.slam.mapping.patch_refiner import PatchRefiner, affine
 from cohdc_train.slam.tracking.tracker import Tracker
 
 PICTURE = cv2.cvtColor(cv2.GaussianBlur(texture(np.random.default_rng(0), 240, 320), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)
 PYRAMID = Pyramid(np.asarray(PICTURE, dtype=np.uint8))
-CORNERS = FeatureExtractor(CAMERA, 150)(cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2RGB), np.ones((240, 320), np.float32))
+CORNERS = OrbExtractor(CAMERA, 150)(cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2RGB), np.ones((240, 320), np.float32))
 INSIDE = ((CORNERS.pixels > 60) & (CORNERS.pixels < (260, 180))).all(axis=1) & (CORNERS.octaves <= 4)
 
 
@@ -82,9 +82,9 @@ def test_the_affine_map_is_the_projections_derivative(tracker: Tracker) -> None:
 
 def test_what_a_rolling_shutter_moved_stays_moved(tracker: Tracker) -> None:
     keyframe = tracker.map.keyframes[0]
-    corners = np.flatnonzero(keyframe.point_ids >= 0)
-    matches, features = Matches(keyframe.point_ids[corners], corners), keyframe.features
-    refiner = Refiner(tracker.map)
+    keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+    matches, features = Matches(keyframe.point_ids[keypoints], keypoints), keyframe.features
+    refiner = PatchRefiner(tracker.map)
     refiner.look_at(gray_of(FIRST_VIEW))
     refiner.remember(keyframe)
     aside = replace(features, pixels=features.pixels + 0.4)
@@ -99,14 +99,14 @@ def test_what_a_rolling_shutter_moved_stays_moved(tracker: Tracker) -> None:
 def test_what_fits_nowhere_is_not_precise(tracker: Tracker) -> None:
     """The same corners where the picture shows something else: none counts for more than it did."""
     keyframe = tracker.map.keyframes[0]
-    corners = np.flatnonzero(keyframe.point_ids >= 0)
-    matches, refiner = Matches(keyframe.point_ids[corners], corners), tracker._refiner
+    keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+    matches, refiner = Matches(keyframe.point_ids[keypoints], keypoints), tracker._refiner
     assert refiner is not None
     for picture, least, most in ((FIRST_VIEW, 0.5, 1.0), (np.ascontiguousarray(FIRST_VIEW[::-1]), 0.0, 0.05)):
         refiner.look_at(gray_of(picture))
         found = refiner.refine(keyframe.features, matches, keyframe.T_cw)
-        assert least <= found.precise.mean() <= most
-        np.testing.assert_array_equal(found.pixels[~found.precise], keyframe.features.pixels[~found.precise])
+        assert least <= found.is_subpixel.mean() <= most
+        np.testing.assert_array_equal(found.pixels[~found.is_subpixel], keyframe.features.pixels[~found.is_subpixel])
 
 
 def test_a_point_without_a_patch_does_not_take_over_a_former_one(tracker: Tracker) -> None:
@@ -147,10 +147,10 @@ def test_a_map_of_refined_measurements_fits_better() -> None:
             assert tracker.track(*render(room(), pose)[:2], k / 30).tracked
         errors = []
         for keyframe in tracker.map.keyframes[1:]:
-            corners = np.flatnonzero(keyframe.point_ids >= 0)
-            corners = corners[tracker.map.born[keyframe.point_ids[corners]] < keyframe.index]
-            local = to_local(keyframe.T_cw, tracker.map.positions[keyframe.point_ids[corners]])
-            errors.append(np.linalg.norm(CAMERA.project(local) - keyframe.features.points[corners], axis=1))
+            keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+            keypoints = keypoints[tracker.map.first_keyframe[keyframe.point_ids[keypoints]] < keyframe.index]
+            local = to_local(keyframe.T_cw, tracker.map.positions[keyframe.point_ids[keypoints]])
+            errors.append(np.linalg.norm(CAMERA.project(local) - keyframe.features.points[keypoints], axis=1))
         left.append(np.median(np.concatenate(errors)))
     assert left[1] < 0.8 * left[0]
 
@@ -174,18 +174,18 @@ def test_only_what_a_patch_was_held_against_is_precise(tracker: Tracker) -> None
     """Where a point was born its patch lies exactly; a corner that becomes its measurement later may be off."""
     keyframe = tracker.map.keyframes[0]
     points = (keyframe.point_ids >= 0) & (keyframe.features.octaves <= 4)
-    assert keyframe.features.precise[points].all()
+    assert keyframe.features.is_subpixel[points].all()
     assert (keyframe.features.sigmas[points] < 0.5 * keyframe.features.scales[points]).all()
-    assert not keyframe.features.precise[~points].any(), "wide patches are seldom flat"
+    assert not keyframe.features.is_subpixel[~points].any(), "wide patches are seldom flat"
     measured = observations(keyframe.features, np.arange(len(points)))
     np.testing.assert_array_equal(measured.sigmas, keyframe.features.sigmas)
     np.testing.assert_array_equal(measured.depth_sigmas, keyframe.features.scales, err_msg="depth is no better known")
-    others = keyframe.features.for_others
+    others = keyframe.features.without_subpixel
     np.testing.assert_array_equal(
         others.sigmas, keyframe.features.scales, err_msg="of other points nothing more is known"
     )
-    assert keyframe.features.precise[points].all()
+    assert keyframe.features.is_subpixel[points].all()
     matches = Matches(keyframe.point_ids[points][:1], np.flatnonzero(points)[:1])
-    tracker.map.forget(keyframe, matches.corners)
+    tracker.map.forget(keyframe, matches.keypoints)
     tracker.map.observe(keyframe, matches)
-    assert not keyframe.features.precise[matches.corners].any()
+    assert not keyframe.features.is_subpixel[matches.keypoints].any()

@@ -8,19 +8,19 @@ from loop_world import poor_view, way_round
 from numpy.typing import NDArray
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
-from cohdc_train.slam.features.orb import FeatureExtractor
-from cohdc_train.slam.geometry.depth_image import Picture, take_picture
+from cohdc_train.slam.features.orb import OrbExtractor
+from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
-from cohdc_train.slam.loop_closing.place_recognition import Places
+from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognition
 from cohdc_train.slam.optimization.image_alignment import align, warp_jacobian
 
 Array = NDArray[np.float64]
 PATH = camera_path(20)
 
 
-def picture(T_wc: Array, rectangles: list[Rectangle] | None = None, gain: float = 1.0) -> Picture:
+def picture(T_wc: Array, rectangles: list[Rectangle] | None = None, gain: float = 1.0) -> DepthImage:
     rgb, depth, moving = render(rectangles or room(), T_wc)
-    return take_picture((rgb * gain).astype(np.uint8), depth, moving, CAMERA)
+    return make_depth_image((rgb * gain).astype(np.uint8), depth, moving, CAMERA)
 
 
 @given(st.integers(0, 10_000))
@@ -74,7 +74,7 @@ def test_what_moves_is_not_in_a_picture() -> None:
     rgb, depth, _ = render(room(), PATH[0])
     mask = np.zeros(depth.shape, dtype=np.bool_)
     mask[:, :160] = True
-    half = take_picture(rgb, depth, mask, CAMERA)
+    half = make_depth_image(rgb, depth, mask, CAMERA)
     assert half.depth.shape == half.gray.shape == (120, 160)
     assert not half.depth[:, :80].any()
     assert (half.depth[:, 84:] > 0).mean() > 0.9
@@ -84,21 +84,21 @@ def test_what_moves_is_not_in_a_picture() -> None:
 def test_a_picture_keeps_the_geometry(size: tuple[int, int]) -> None:
     width, height = size
     camera = type(CAMERA)(500.0, 510.0, width / 2 + 7, height / 2 - 3, width, height, 5000.0)
-    small = take_picture(
+    small = make_depth_image(
         np.zeros((height, width, 3), dtype=np.uint8), np.ones((height, width), dtype=np.float32), None, camera
     )
     assert max(small.gray.shape) == 160
-    corner = np.array([[width - 0.5, height - 0.5]])  # the image's border, seen along the same ray in both
-    ray = camera.backproject(corner, np.ones(1))
+    keypoint = np.array([[width - 0.5, height - 0.5]])  # the image's border, seen along the same ray in both
+    ray = camera.backproject(keypoint, np.ones(1))
     np.testing.assert_allclose(
         small.camera.project(ray)[0], [small.gray.shape[1] - 0.5, small.gray.shape[0] - 0.5], atol=1e-9
     )
 
 
 def test_a_place_is_recognised_among_others() -> None:
-    rng, extract = np.random.default_rng(0), FeatureExtractor(CAMERA, 300)
+    rng, extract = np.random.default_rng(0), OrbExtractor(CAMERA, 300)
     poses = way_round(24, turns=0.95)
-    places = Places()
+    places = PlaceRecognition()
     for number, pose in enumerate(poses):
         places.add(number, extract(*poor_view(pose, rng)).descriptors)
     nudge = exp_se3(np.array([0.05, 0.02, -0.05, 0.01, 0.03, 0.02]))

@@ -16,7 +16,7 @@ from cohdc_train.slam.optimization.ransac import ransac_pose, rigid_transforms
 from cohdc_train.slam.optimization.reprojection import (
     CHI2_DEPTH,
     Observations,
-    Weighing,
+    ReprojectionModel,
     chi_square,
     pose_jacobian,
     residual_jacobian,
@@ -24,7 +24,7 @@ from cohdc_train.slam.optimization.reprojection import (
 )
 
 Array = NDArray[np.float64]
-WEIGHING = Weighing(CAMERA)
+REPROJECTION = ReprojectionModel(CAMERA)
 
 
 def cloud(rng: np.random.Generator, count: int) -> Array:
@@ -36,7 +36,7 @@ def observe(T_cw: Array, points: Array, rng: np.random.Generator, noise: float =
     """What the camera measures, a fifth of it without depth; noise in px, and as disparity in depth."""
     local = to_local(T_cw, points)
     pixels = CAMERA.project(local) + rng.normal(size=(len(points), 2)) * noise
-    depths = WEIGHING.bf / (WEIGHING.bf / local[:, 2] + rng.normal(size=len(points)) * noise)
+    depths = REPROJECTION.bf / (REPROJECTION.bf / local[:, 2] + rng.normal(size=len(points)) * noise)
     depths[rng.random(len(points)) < 0.2] = np.nan
     sigmas = rng.choice([[1.0, 1.0], [1.2, 1.2], [1.44, 1.44], [0.8, 1.2]], size=len(points)).T
     return Observations(pixels, depths, *sigmas)
@@ -56,11 +56,11 @@ def test_jacobians_equal_differences(seed: int) -> None:
     T_cw, points = exp_se3(rng.normal(size=6) * 0.1), cloud(rng, 8)
     seen = observe(T_cw, points, rng, noise=2.0)
     local = to_local(T_cw, points)
-    derivative = residual_jacobian(local, seen, WEIGHING)
+    derivative = residual_jacobian(local, seen, REPROJECTION)
     by_pose, by_point = pose_jacobian(local, derivative), derivative @ T_cw[:3, :3]
 
     def error(T: Array, shift: Array) -> Array:
-        return residuals(to_local(T, points + shift), seen, WEIGHING)
+        return residuals(to_local(T, points + shift), seen, REPROJECTION)
 
     for axis in range(6):
         step = np.eye(6)[axis] * 1e-6
@@ -78,7 +78,7 @@ def test_pose_is_found_and_outliers_are_told() -> None:
     T_cw, points = exp_se3(np.array([0.1, -0.05, 0.2, 0.05, -0.1, 0.02])), cloud(rng, 200)
     seen = observe(T_cw, points, rng, noise=0.1)
     seen.pixels[:30] += rng.uniform(15, 40, size=(30, 2))
-    found, inlier = optimize_pose(np.eye(4), points, seen, WEIGHING)
+    found, inlier = optimize_pose(np.eye(4), points, seen, REPROJECTION)
     assert np.linalg.norm(found[:3, 3] - T_cw[:3, 3]) < 1e-3
     assert not inlier[:30].any()
     assert inlier[30:].all()
@@ -87,7 +87,7 @@ def test_pose_is_found_and_outliers_are_told() -> None:
 def test_a_point_behind_the_camera_is_never_an_inlier() -> None:
     points = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
     seen = Observations(np.full((2, 2), [CAMERA.cx, CAMERA.cy]), np.full(2, np.nan), np.ones(2), np.ones(2))
-    np.testing.assert_array_equal(chi_square(np.eye(4), points, seen, WEIGHING) < CHI2_DEPTH, [False, True])
+    np.testing.assert_array_equal(chi_square(np.eye(4), points, seen, REPROJECTION) < CHI2_DEPTH, [False, True])
 
 
 @given(st.integers(0, 10_000))
@@ -107,7 +107,7 @@ def test_ransac_survives_sixty_percent_outliers() -> None:
     assert found is not None
     assert found[1][90:].mean() > 0.9
     assert found[1][:90].mean() < 0.1
-    refined, _ = optimize_pose(found[0], points[found[1]], seen.take(found[1]), WEIGHING)
+    refined, _ = optimize_pose(found[0], points[found[1]], seen.take(found[1]), REPROJECTION)
     assert np.linalg.norm(refined[:3, 3] - T_cw[:3, 3]) < 0.01
 
 
@@ -148,13 +148,13 @@ def test_schur_bundle_adjustment_equals_a_general_solver() -> None:
         moved = poses.copy()
         moved[problem.free] = exp_se3(x[:18].reshape(3, 6)) @ poses[problem.free]
         local = local_points(moved, x[18:].reshape(-1, 3), problem)
-        return residuals(local, problem.seen, WEIGHING).reshape(-1)
+        return residuals(local, problem.seen, REPROJECTION).reshape(-1)
 
     expected = least_squares(error, np.r_[np.zeros(18), points.reshape(-1)], method="lm", xtol=1e-14, ftol=1e-14)
     got_poses, got_points = poses, points
     for _ in range(4):  # it stops when a step gains less than a thousandth
-        got_poses, got_points = adjust(got_poses, got_points, problem, WEIGHING, steps=20, robust=False)
-    cost = measurement_chi2(got_poses, got_points, problem, WEIGHING).sum()
+        got_poses, got_points = adjust(got_poses, got_points, problem, REPROJECTION, steps=20, robust=False)
+    cost = measurement_chi2(got_poses, got_points, problem, REPROJECTION).sum()
     assert cost == pytest.approx(2 * expected.cost, rel=1e-6)
     wanted = exp_se3(expected.x[:18].reshape(3, 6)) @ poses[problem.free]
     np.testing.assert_allclose(got_poses[problem.free], wanted, atol=1e-5)
@@ -163,11 +163,11 @@ def test_schur_bundle_adjustment_equals_a_general_solver() -> None:
 
 def test_bundle_adjustment_tells_outliers_and_leaves_fixed_poses() -> None:
     true_poses, _, poses, points, problem = small_problem(5, outliers=6)
-    new_poses, new_points = adjust(poses, points, problem, WEIGHING, steps=20)
-    good = measurement_chi2(new_poses, new_points, problem, WEIGHING) <= problem.seen.limits
+    new_poses, new_points = adjust(poses, points, problem, REPROJECTION, steps=20)
+    good = measurement_chi2(new_poses, new_points, problem, REPROJECTION) <= problem.seen.limits
     assert not good[:6].any()
     assert good[6:].all()
-    new_poses, _ = adjust(new_poses, new_points, problem.take(good), WEIGHING, steps=20, robust=False)
+    new_poses, _ = adjust(new_poses, new_points, problem.take(good), REPROJECTION, steps=20, robust=False)
     np.testing.assert_array_equal(new_poses[:2], poses[:2])
     before = np.linalg.norm(poses[2:, :3, 3] - true_poses[2:, :3, 3], axis=1)
     after = np.linalg.norm(new_poses[2:, :3, 3] - true_poses[2:, :3, 3], axis=1)
@@ -177,9 +177,9 @@ def test_bundle_adjustment_tells_outliers_and_leaves_fixed_poses() -> None:
 def test_the_cost_never_rises_from_a_bad_start() -> None:
     _, _, poses, points, problem = small_problem(6)
     points = points + np.random.default_rng(0).normal(size=points.shape) * 0.4
-    before = measurement_chi2(poses, points, problem, WEIGHING).sum()
-    result = adjust(poses, points, problem, WEIGHING, steps=3, robust=False)
-    assert measurement_chi2(*result, problem, WEIGHING).sum() < before
+    before = measurement_chi2(poses, points, problem, REPROJECTION).sum()
+    result = adjust(poses, points, problem, REPROJECTION, steps=3, robust=False)
+    assert measurement_chi2(*result, problem, REPROJECTION).sum() < before
 
 
 def test_a_problem_refuses_unsorted_cameras() -> None:
@@ -193,6 +193,6 @@ def test_too_few_points_for_a_pose_are_still_judged() -> None:
     T_cw, points = exp_se3(rng.normal(size=6) * 0.1), cloud(rng, 5)
     seen = observe(T_cw, points, rng)
     seen.pixels[2] += 50.0
-    pose, inlier = optimize_pose(T_cw, points, seen, WEIGHING)
+    pose, inlier = optimize_pose(T_cw, points, seen, REPROJECTION)
     np.testing.assert_array_equal(pose, T_cw)
     assert inlier.tolist() == [True, True, False, True, True]

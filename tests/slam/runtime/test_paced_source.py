@@ -9,14 +9,14 @@ from plane_world import CAMERA
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.frame import View
-from cohdc_train.slam.runtime.latest_slot import Slot
-from cohdc_train.slam.runtime.paced_source import Paced
+from cohdc_train.slam.runtime.latest_slot import LatestSlot
+from cohdc_train.slam.runtime.paced_source import PacedSource
 
 LONG = 20.0  # s: no wait of a thread here takes that long unless it hangs
 
 
 def test_a_slot_holds_the_newest_and_counts_the_rest() -> None:
-    slot: Slot[int] = Slot()
+    slot: LatestSlot[int] = LatestSlot()
     assert slot.poll() is None
     for number in range(1000):
         slot.put(number)
@@ -30,7 +30,7 @@ def test_a_slot_holds_the_newest_and_counts_the_rest() -> None:
 
 
 def test_a_slot_closed_with_an_error_raises_it_where_it_is_read() -> None:
-    slot: Slot[int] = Slot()
+    slot: LatestSlot[int] = LatestSlot()
     slot.close(DataError("broken.png: not an image"))
     with pytest.raises(DataError, match=r"broken\.png"):
         slot.take()
@@ -92,7 +92,7 @@ def test_an_answer_ends_the_latency_and_the_time_until_the_next_view_is_spent() 
     source, clock = Gated(3), Still()
     source.allowed.release(2)
     spent = []
-    with Paced(source, clock) as paced:
+    with PacedSource(source, clock) as paced:
         for taken in paced:
             assert paced.spent() <= 0
             if taken.name == "1":
@@ -112,7 +112,7 @@ def test_views_that_come_while_the_tracker_is_busy_are_dropped_and_counted() -> 
     source, clock = Gated(9), Still()
     source.allowed.release(2)
     given = []
-    with Paced(source, clock) as paced:
+    with PacedSource(source, clock) as paced:
         for taken in paced:
             given.append(int(taken.name))
             if given == [0, 1]:
@@ -147,7 +147,7 @@ class SlowToRead:
 
 def test_reading_slower_than_the_recording_delays_it_instead_of_piling_up() -> None:
     clock = Still()
-    with Paced(SlowToRead(clock), clock) as paced:
+    with PacedSource(SlowToRead(clock), clock) as paced:
         given = list(paced)
     assert paced.behind == pytest.approx(3 * (0.1 - 1 / 30))
     np.testing.assert_allclose(clock.waits, [0.2, 0.3, 0.4])
@@ -157,5 +157,5 @@ def test_reading_slower_than_the_recording_delays_it_instead_of_piling_up() -> N
 def test_a_broken_image_ends_the_run_with_its_error() -> None:
     source = Gated(9, broken=3)
     source.allowed.release(9)
-    with Paced(source, Still()) as paced, pytest.raises(DataError, match=r"7\.png: broken"):
+    with PacedSource(source, Still()) as paced, pytest.raises(DataError, match=r"7\.png: broken"):
         list(paced)

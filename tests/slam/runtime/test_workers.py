@@ -185,7 +185,7 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
     added = later.seen_points()
     assert len(added) == 20
     seen = to_local(later.T_cw, world.positions[added])
-    good = np.ones(len(window.corners), dtype=np.bool_)
+    good = np.ones(len(window.keypoints), dtype=np.bool_)
     good[-30:] = False
     before = np.count_nonzero(newest.point_ids >= 0)
     motion = close_window(world, window, Solution(step @ np.stack(window.poses), window.points + 0.01, good))

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.config import Method
-from cohdc_train.slam.features.keypoints import Corners
+from cohdc_train.slam.features.keypoints import Keypoints
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.frame import Pose
 from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.slam.optimization.reprojection import Prior
 from cohdc_train.slam.tracking.flow_tracker import FlowTracker, Followed
-from cohdc_train.slam.tracking.motion_model import Expectation
+from cohdc_train.slam.tracking.motion_model import Prediction
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 31
-STILL = Expectation(Prior(np.eye(4), np.zeros((6, 6))), calm=False)
+STILL = Prediction(Prior(np.eye(4), np.zeros((6, 6))), calm=False)
 View = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
 
 
@@ -43,7 +43,7 @@ class Watched:
         self.poses: list[Pose] = []
         find = self.tracker._extract.find
 
-        def noted(*arguments: Any) -> Corners:
+        def noted(*arguments: Any) -> Keypoints:
             self.searched.append(len(self.poses))
             return find(*arguments)
 
@@ -68,7 +68,7 @@ def test_two_of_three_frames_need_no_corners_and_are_as_exact(
         matched.track(view)
         features = flow.tracker.features
         assert features is not None
-        assert len(flow.poses) < 3 or features.precise.mean() > 0.3, "what a patch told is carried along"
+        assert len(flow.poses) < 3 or features.is_subpixel.mean() > 0.3, "what a patch told is carried along"
     assert matched.searched == list(range(FRAMES))
     assert flow.searched == list(range(0, FRAMES, 3))
     assert all(pose.tracked for pose in flow.poses)
@@ -151,14 +151,14 @@ def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become
     flow, tracker = begun(views[0])
     first = flow.follow(views[0][0], None, np.eye(4))
     assert first is not None
-    precise = first.ids[first.corners.precise]
-    old, new = precise[:1], precise[1:2]
-    tracker.map.became[old] = new
+    is_subpixel = first.ids[first.keypoints.is_subpixel]
+    old, new = is_subpixel[:1], is_subpixel[1:2]
+    tracker.map.merged_into[old] = new
     again = flow.follow(views[0][0], None, np.eye(4))
     assert again is not None
     assert old not in again.ids
     assert np.count_nonzero(again.ids == new) == 1, "no point is followed twice"
-    tracker.map.became[old] = -1
+    tracker.map.merged_into[old] = -1
 
 
 def test_of_many_points_a_frame_follows_every_second_and_the_next_the_others(
@@ -251,7 +251,7 @@ def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
     flow, tracker = begun(views[0])
     followed = flow.follow(views[0][0], None, np.eye(4))
     assert followed is not None
-    features = tracker._extract.measure(followed.corners, views[0][1])
+    features = tracker._extract.measure(followed.keypoints, views[0][1])
     fit = flow.locate(followed, features, STILL)
     assert fit is not None
     np.testing.assert_allclose(fit.T_cw, np.eye(4), atol=1e-4)
@@ -268,8 +268,8 @@ def test_a_frame_in_which_flow_loses_many_points_is_matched_after_the_answer(
     followed = flow.follow(views[0][0], None, np.eye(4))
     assert followed is not None
     some = np.arange(round(found * len(followed.ids)))
-    left = Followed(followed.ids[some], followed.corners.take(some))
-    fit = flow.locate(left, tracker._extract.measure(left.corners, views[0][1]), STILL)
+    left = Followed(followed.ids[some], followed.keypoints.take(some))
+    fit = flow.locate(left, tracker._extract.measure(left.keypoints, views[0][1]), STILL)
     assert (fit is not None) == answers
     if fit is not None:
         np.testing.assert_allclose(fit.T_cw, np.eye(4), atol=1e-4)
@@ -304,15 +304,15 @@ def test_few_points_are_weighed_against_what_was_expected(views: list[View]) -> 
     flow, tracker = begun(views[0])
     followed = flow.follow(views[0][0], None, np.eye(4))
     assert followed is not None
-    features = tracker._extract.measure(followed.corners, views[0][1])
+    features = tracker._extract.measure(followed.keypoints, views[0][1])
     assert tracker._last is not None
     some = np.arange(100)
     few = replace(tracker._last, matches=Matches(followed.ids[some], some))
     flow.begin(views[0][0], features, few, None)
     again = flow.follow(views[0][0], None, np.eye(4))
     assert again is not None
-    steady = Expectation(Prior(np.eye(4), 1e12 * np.eye(6)), calm=True)
-    seen = tracker._extract.measure(again.corners, views[0][1])
+    steady = Prediction(Prior(np.eye(4), 1e12 * np.eye(6)), calm=True)
+    seen = tracker._extract.measure(again.keypoints, views[0][1])
     moved = replace(seen, points=seen.points + 0.5)
     weighed, alone = flow.locate(again, moved, steady), flow.locate(again, moved, STILL)
     assert weighed is not None

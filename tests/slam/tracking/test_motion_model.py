@@ -8,9 +8,9 @@ from plane_world import CAMERA, camera_path, render, room
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, log_se3, to_local
 from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
-from cohdc_train.slam.optimization.reprojection import Observations, Prior, Weighing
+from cohdc_train.slam.optimization.reprojection import Observations, Prior, ReprojectionModel
 from cohdc_train.slam.tracking import motion_model as motion_module
-from cohdc_train.slam.tracking.motion_model import _EXACT, ACCELERATION, Motion
+from cohdc_train.slam.tracking.motion_model import _EXACT, ACCELERATION, MotionModel
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
@@ -25,8 +25,8 @@ def at(t: float) -> NDArray[np.float64]:
     return exp_se3(VELOCITY * t)
 
 
-def moved(times: list[float]) -> Motion:
-    motion = Motion()
+def moved(times: list[float]) -> MotionModel:
+    motion = MotionModel()
     for t in times:
         motion.found(t, at(t), SURE)
     return motion
@@ -50,7 +50,7 @@ def test_after_a_long_pause_the_camera_is_not_held_to_have_gone_on_for_ever() ->
 
 
 def test_nothing_is_known_before_two_frames_nor_after_a_loss() -> None:
-    motion = Motion()
+    motion = MotionModel()
     assert motion.twist is None
     motion.found(0.0, np.eye(4), SURE)
     assert motion.twist is None
@@ -81,7 +81,7 @@ def test_a_leap_is_believed_and_the_velocity_is_then_unknown_again() -> None:
 
 
 def test_a_start_that_a_hand_can_make_gives_a_velocity_at_once() -> None:
-    motion = Motion()
+    motion = MotionModel()
     for k in range(12):
         motion.found(k * STEP, np.eye(4), SURE)
     start = np.array([0.05, 0, 0, 0, 0, 0.04])
@@ -127,7 +127,7 @@ def test_errors_are_as_large_as_foreseen() -> None:
     """Cameras shoved at random, seen with noise: squared distances in sigmas from what was expected average 6."""
     rng, squares = np.random.default_rng(0), []
     for _ in range(40):
-        motion, T_cw, velocity = Motion(), np.eye(4), rng.normal(0, 0.3, 6)
+        motion, T_cw, velocity = MotionModel(), np.eye(4), rng.normal(0, 0.3, 6)
         for k in range(30):
             if k > 5:
                 off = log_se3(T_cw @ inverse(motion.expected(k * STEP).prior.T_cw))
@@ -154,14 +154,14 @@ def test_an_expectation_decides_where_little_is_seen_and_only_there() -> None:
     errors = {}
     for count, spread in ((20, 30.0), (2000, 200.0)):
         points, seen = world(count, spread)
-        alone, _ = optimize_pose(np.eye(4), points, seen, Weighing(CAMERA))
-        both, _ = optimize_pose(np.eye(4), points, seen, Weighing(CAMERA), prior=expected)
+        alone, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA))
+        both, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA), prior=expected)
         errors[count] = np.linalg.norm(alone[:3, 3]), np.linalg.norm(both[:3, 3])
     assert errors[20][0] > 0.01
     assert errors[20][1] < 0.2 * errors[20][0]
     elsewhere = Prior(exp_se3(np.array([0.01, 0, 0, 0, 0, 0])), expected.information)
     points, seen = world(2000, 200.0)
-    pulled, _ = optimize_pose(np.eye(4), points, seen, Weighing(CAMERA), prior=elsewhere)
+    pulled, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA), prior=elsewhere)
     assert np.linalg.norm(pulled[:3, 3]) < 0.004, "what is seen outweighs an expectation that lies 1 cm off"
 
 
@@ -182,7 +182,7 @@ def test_the_pull_is_the_gradient_of_the_squared_distance() -> None:
 
 def test_information_says_how_poses_scatter() -> None:
     points, _ = world(60, 100.0)
-    rng, true = np.random.default_rng(3), Weighing(CAMERA)
+    rng, true = np.random.default_rng(3), ReprojectionModel(CAMERA)
     local = to_local(np.eye(4), points)
     pixels, depths = CAMERA.project(local), local[:, 2]
     steps = []

@@ -7,9 +7,9 @@ from plane_world import CAMERA, camera_path, render, room
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import MAX_KEYPOINTS
-from cohdc_train.slam.features.keypoints import Corners, Features
+from cohdc_train.slam.features.keypoints import Features, Keypoints
 from cohdc_train.slam.features.matching import Matches, Projected, match_projected, one_to_one
-from cohdc_train.slam.features.orb import FeatureExtractor
+from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import Pose
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
 from cohdc_train.slam.tracking.tracker import Tracker
@@ -137,13 +137,13 @@ def test_a_picture_matched_whole_takes_depth_at_its_own_time_too(
     measure, lags = tracker._extract.measure, []
 
     def watched(
-        corners: Corners,
+        keypoints: Keypoints,
         depth: NDArray[np.float32],
         mask: NDArray[np.bool_] | None,
         lag: NDArray[np.float64] | None,
     ) -> Features:
         lags.append(lag)
-        return measure(corners, depth, mask, lag)
+        return measure(keypoints, depth, mask, lag)
 
     monkeypatch.setattr(tracker._extract, "measure", watched)
     assert tracker.track(*views[4][:2], 4 / 30, EVERYTHING, depth_t=4 / 30 + 0.01).tracked
@@ -174,12 +174,12 @@ def features_at(points: list[tuple[float, float]], words: list[int], octaves: li
 
 
 @pytest.mark.parametrize(
-    ("corner", "octave", "word", "found"),
+    ("keypoint", "octave", "word", "found"),
     [((52.0, 40.0), 0, 0b0, True), ((59.0, 40.0), 0, 0b0, False), ((52.0, 40.0), 2, 0b0, False)],
     ids=["near", "too far", "other level"],
 )
-def test_matching_by_projection(corner: tuple[float, float], octave: int, word: int, found: bool) -> None:
-    features = features_at([corner], [word], [octave])
+def test_matching_by_projection(keypoint: tuple[float, float], octave: int, word: int, found: bool) -> None:
+    features = features_at([keypoint], [word], [octave])
     projected = Projected(np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64))
     matches = match_projected(projected, features, radius=5.0)
     assert matches.points.tolist() == ([77] if found else [])
@@ -188,10 +188,10 @@ def test_matching_by_projection(corner: tuple[float, float], octave: int, word: 
 def test_matches_are_one_to_one_and_clear() -> None:
     # point 0 likes corner 0 best; point 1 likes it too but less; point 2 cannot tell corners 1 and 2 apart
     i, j, bits = np.array([0, 0, 1, 2, 2]), np.array([0, 1, 0, 1, 2]), np.array([10, 60, 20, 30, 31])
-    points, corners = one_to_one(i, j, bits, ratio=0.9)
+    points, keypoints = one_to_one(i, j, bits, ratio=0.9)
     assert points.tolist() == [0]
-    assert corners.tolist() == [0]
-    assert len(Matches(points, corners)) == 1
+    assert keypoints.tolist() == [0]
+    assert len(Matches(points, keypoints)) == 1
 
 
 @pytest.mark.parametrize(
@@ -214,4 +214,4 @@ def test_frame_that_does_not_fit_is_refused(changes: dict[str, object], message:
 
 
 def test_number_of_keypoints_has_one_default() -> None:
-    assert Tracker(CAMERA).budget == FeatureExtractor(CAMERA).budget == MAX_KEYPOINTS
+    assert Tracker(CAMERA).budget == OrbExtractor(CAMERA).budget == MAX_KEYPOINTS

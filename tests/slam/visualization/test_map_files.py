@@ -50,22 +50,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("name", "least"), [("map.ply", 300), ("cloud.ply", 20_000)])
 def test_points_lie_on_what_stands_still(run: Path, name: str, least: int) -> None:
-    points, colours = read_ply(run / name)
+    points, colors = read_ply(run / name)
     assert len(points) > least
     assert np.median(off_the_room(points)) < 0.003
     assert np.mean(off_the_room(points) > 0.03) < 0.01
     assert not on_the_board(points).any()
-    assert colours.std() > 20, "the room is colourful"
+    assert colors.std() > 20, "the room is colourful"
 
 
 def test_points_have_the_colours_of_the_room(run: Path) -> None:
-    points, colours = read_ply(run / "cloud.ply")
+    points, colors = read_ply(run / "cloud.ply")
     rgb, depth, _ = render(room(), np.eye(4))
     columns, rows = np.rint(CAMERA.project(points)).astype(int).T
     inside = (columns >= 0) & (rows >= 0) & (columns < CAMERA.width) & (rows < CAMERA.height)
     columns, rows, z = columns[inside], rows[inside], points[inside, 2]
     front = np.abs(depth[rows, columns] - z) < 0.02
-    difference = np.abs(rgb[rows, columns].astype(int) - colours[inside])[front].mean(axis=1)
+    difference = np.abs(rgb[rows, columns].astype(int) - colors[inside])[front].mean(axis=1)
     assert np.median(difference) < 12
 
 
@@ -137,10 +137,10 @@ clouds = arrays(np.float64, st.tuples(st.integers(1, 60), st.just(3)), elements=
 def test_cubes_hold_means_whatever_the_order(points: Points, seed: int) -> None:
     rng = np.random.default_rng(seed)
     grids = [VoxelGrid(0.5) for _ in range(2)]
-    colours = rng.integers(0, 256, points.shape).astype(np.uint8)
+    colors = rng.integers(0, 256, points.shape).astype(np.uint8)
     for grid, order in zip(grids, (np.arange(len(points)), rng.permutation(len(points))), strict=True):
         for part in np.array_split(order, 3):
-            grid.add(points[part], colours[part], 0)
+            grid.add(points[part], colors[part], 0)
     first, second = (grid.cells(1)[0] for grid in grids)
     np.testing.assert_allclose(first, second, atol=1e-9)
     assert len(first) == len(np.unique(np.floor(points / 0.5), axis=0))
@@ -160,21 +160,21 @@ def test_memory_is_bounded_by_larger_cubes(points: Points) -> None:
 
 def test_seen_from_above_right_is_right_and_forward_is_up() -> None:
     places = np.array([[0, 1, 4.0], [2, 1, 2.0], [-2, 1, 2.0], [0, -3, 3.0]])
-    colours = np.array([[0, 0, 255], [0, 255, 0], [1, 2, 3], [255, 0, 255]], dtype=np.uint8)
-    image = from_above(Cloud(places, colours), [np.eye(4)])
+    colors = np.array([[0, 0, 255], [0, 255, 0], [1, 2, 3], [255, 0, 255]], dtype=np.uint8)
+    image = from_above(Cloud(places, colors), [np.eye(4)])
 
-    def place(colour: list[int]) -> NDArray[np.float64]:
-        return np.argwhere((image == colour).all(axis=2)).mean(axis=0)
+    def place(color: list[int]) -> NDArray[np.float64]:
+        return np.argwhere((image == color).all(axis=2)).mean(axis=0)
 
     ahead, right, left = place([0, 0, 255]), place([0, 255, 0]), place([1, 2, 3])
     assert ahead[0] < right[0] == left[0]
     assert left[1] < ahead[1] < right[1]
-    assert not (image == colours[3]).all(axis=2).any(), "a ceiling is left out"
+    assert not (image == colors[3]).all(axis=2).any(), "a ceiling is left out"
 
 
 def test_a_known_ply_file(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", np.array([[1.0, -2.5, 3.0]]), np.array([[7, 8, 9]], np.uint8))
-    points, colours = read_ply(tmp_path / "a.ply")
+    points, colors = read_ply(tmp_path / "a.ply")
     assert points.tolist() == [[1.0, -2.5, 3.0]]
-    assert colours.tolist() == [[7, 8, 9]]
+    assert colors.tolist() == [[7, 8, 9]]
     assert (tmp_path / "a.ply").read_bytes().endswith(np.array([1, -2.5, 3], "<f4").tobytes() + bytes([7, 8, 9]))
