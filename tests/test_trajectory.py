@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cohdc_train.errors import DataError
+from cohdc_train.trajectory import metrics
 from cohdc_train.trajectory.association import associate, match
 from cohdc_train.trajectory.evaluate import coverage, evaluate, score
 from cohdc_train.trajectory.metrics import align_umeyama, all_pairs, ate, pairs_apart, rpe, statistics
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
-from cohdc_train.trajectory.trajectory import trajectory as trajectories
 
 TUM = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum"
 needs_tum = pytest.mark.skipif(not TUM.is_dir(), reason=f"{TUM} is absent")
@@ -202,7 +202,7 @@ def test_all_pairs_are_those_of_tums_tool() -> None:
 
 
 def test_long_runs_are_sampled_with_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trajectories, "MAX_PAIRS", 20_000)
+    monkeypatch.setattr(metrics, "MAX_PAIRS", 20_000)
     n = 150
     rng = np.random.default_rng(6)
     truth, estimate = wander(rng, n=n), wander(rng, n=n, noise=0.02)

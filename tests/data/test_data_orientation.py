@@ -20,7 +20,7 @@ from cohdc_train.cli import main
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoImage, find_split, read_split
 from cohdc_train.data.datamodule import CocoDataModule
-from cohdc_train.data.doctor.doctor import sample_grid as grid
+from cohdc_train.data.doctor import sample_grid as grid
 from cohdc_train.exporter.sample_images import read_images
 from cohdc_train.images import orientation_of, read_rgb
 from cohdc_train.prediction.image_sources import read_pictures
