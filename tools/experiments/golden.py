@@ -29,7 +29,7 @@ from pathlib import Path
 
 from golden_cases import CASES, Case
 from golden_checkout import REPOSITORY, Checkout, CommandFailedError, Elapsed, checked_out
-from golden_compare import DepthComparison, compare_folders
+from golden_compare import Comparison, compare_folders
 from golden_inputs import Inputs
 
 _NAMES = [case.name for case in CASES]
@@ -45,7 +45,7 @@ class Pair:
         (folder / "inputs").mkdir(parents=True)
         self.inputs = Inputs(folder / "inputs", base, shared)
 
-    def run(self, case: Case, with_pictures: bool) -> tuple[DepthComparison, list[Elapsed]]:
+    def run(self, case: Case, with_pictures: bool) -> tuple[Comparison, list[Elapsed]]:
         """Run a case in both and compare. Raises CommandFailedError."""
         source = case.prepare(self.inputs)
         folders = [self.folder / side / case.name for side in ("base", "head")]

@@ -16,7 +16,7 @@ _PICTURE_FOLDERS = {"pictures", "overlays"}
 
 
 @dataclass(frozen=True)
-class DepthComparison:
+class Comparison:
     """Result of comparing two folders.
 
     Attributes:
@@ -30,7 +30,7 @@ class DepthComparison:
     num_files: int
 
 
-def compare_folders(base: Path, head: Path, with_pictures: bool = False) -> DepthComparison:
+def compare_folders(base: Path, head: Path, with_pictures: bool = False) -> Comparison:
     """Compare all result files of two folders.
 
     Args:
@@ -52,7 +52,7 @@ def compare_folders(base: Path, head: Path, with_pictures: bool = False) -> Dept
         if name in base_files:
             content = hashlib.sha256(comparable_bytes(base / name)).hexdigest()
             digest.update(f"{name} {content}\n".encode())
-    return DepthComparison(different, digest.hexdigest(), len(base_files))
+    return Comparison(different, digest.hexdigest(), len(base_files))
 
 
 def result_files(folder: Path, with_pictures: bool = False) -> set[str]:
