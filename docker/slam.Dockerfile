@@ -1,4 +1,4 @@
-# The robot: cohdc predict, slam and evaluate. No torch. tools/check_docker runs the install steps without docker.
+# The robot: cohdc predict, slam and evaluate. No torch. .ci/check_docker runs the install steps without docker.
 #   docker build -f docker/slam.Dockerfile -t cohdc-slam .
 #   docker run --rm -v "$PWD/data:/data" cohdc-slam slam --sequence /data/rgbd_dataset_freiburg3_walking_xyz --out /data/run
 FROM python:3.11-slim

@@ -1,4 +1,4 @@
-# The workstation: everything, with torch on CUDA. tools/check_docker runs the install steps without docker.
+# The workstation: everything, with torch on CUDA. .ci/check_docker runs the install steps without docker.
 #   docker build -f docker/train.Dockerfile -t cohdc-train .
 #   docker run --rm --gpus all --shm-size 8g -v "$PWD:/data" cohdc-train fit --help
 FROM nvidia/cuda:13.0.1-base-ubuntu24.04

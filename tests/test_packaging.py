@@ -123,7 +123,7 @@ def test_wheel_tracks_and_scores_a_sequence(clean: Clean) -> None:
 
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.stem)
 def test_dockerfile_copies_what_exists_and_pins(dockerfile: Path) -> None:
-    steps = load_tool("check_docker").instructions(dockerfile)
+    steps = load_tool("../.ci/check_docker").instructions(dockerfile)
     copied = [name for instruction, argument in steps if instruction == "COPY" for name in argument.split()[:-1]]
     assert copied
     assert [name for name in copied if not (ROOT / name).exists()] == []
@@ -134,7 +134,7 @@ def test_dockerfile_copies_what_exists_and_pins(dockerfile: Path) -> None:
 
 
 def test_checker_follows_a_dockerfile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tool = load_tool("check_docker")
+    tool = load_tool("../.ci/check_docker")
     monkeypatch.setattr(tool, "ROOT", tmp_path)
     monkeypatch.setattr(tool.venv, "create", lambda folder, with_pip: None)
     (tmp_path / "room").mkdir()

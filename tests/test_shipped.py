@@ -49,7 +49,7 @@ def test_the_card_tells_the_stored_figures(name: str, size: str) -> None:
     names = {"mask AP50": "segm_AP50", "mask AP": "segm_AP", "Boundary AP": "boundary_AP", "box AP50": "box_AP50"}
     told = {key: float(rows[name]) for name, key in names.items()}
     assert told == {key: pytest.approx(stored["int8"][key], abs=5e-4) for key in names.values()}
-    for word in ("Licence", "COCO", "ImageNet", f"tools/person_model {size}"):
+    for word in ("Licence", "COCO", "ImageNet", f"tools/experiments/person_model.py {size}"):
         assert word in card
 
 

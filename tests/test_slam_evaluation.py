@@ -1,4 +1,4 @@
-"""tools/slam_evaluation: renders once, runs what is missing, and tells what it found."""
+"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, and tells what it found."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ pytest.importorskip("embreex")
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    return load_tool("slam_evaluation")
+    return load_tool("experiments/slam_evaluation.py")
 
 
 @pytest.fixture(scope="module")

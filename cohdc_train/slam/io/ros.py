@@ -1,7 +1,8 @@
 """ROS 2 messages to frames and back, without ROS: a message is anything with the fields of the type that is named.
 
-tools/ros2_node is the node around it. Poses go out in ROS's axes (REP 103: x forward, y left, z up), where the first
-camera is taken to look level; inside, the world has the axes of the first camera (x right, y down, z forward).
+tools/ros2/cohdc_slam_node.py is the node around it. Poses go out in ROS's axes (REP 103: x forward, y left, z up),
+where the first camera is taken to look level; inside, the world has the axes of the first camera (x right, y down,
+z forward).
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""tools/carried_masks: how well masks are carried on, measured."""
+"""tools/experiments/carried_masks.py: how well masks are carried on, measured."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ from tool_loader import load_tool
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    return load_tool("carried_masks")
+    return load_tool("experiments/carried_masks.py")
 
 
 def run(tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: int, *steps: str) -> None:

@@ -190,7 +190,7 @@ def drive(node: Any) -> None:
 
 @pytest.fixture
 def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """tools/ros2_node among stand-ins for the modules of ROS 2 that it imports."""
+    """tools/ros2/cohdc_slam_node.py among stand-ins for the modules of ROS 2 that it imports."""
     contents: dict[str, dict[str, Any]] = {
         "rclpy": {"init": lambda **_: None, "spin": drive, "try_shutdown": lambda: None},
         "rclpy.node": {"Node": Node},
@@ -209,7 +209,7 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         module.__dict__.update(members)
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    return load_tool("ros2_node")
+    return load_tool("ros2/cohdc_slam_node.py")
 
 
 def test_the_node_publishes_and_writes(ros: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

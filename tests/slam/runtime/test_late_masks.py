@@ -1,4 +1,4 @@
-"""tools/late_masks: real time without a clock."""
+"""tools/experiments/late_masks.py: real time without a clock."""
 
 import json
 import sys
@@ -17,7 +17,7 @@ from cohdc_train.slam.run import slam
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    return load_tool("late_masks")
+    return load_tool("experiments/late_masks.py")
 
 
 def square(frame: int) -> NDArray[np.bool_]:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from at_once import AtOnce
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room
 
@@ -15,6 +14,7 @@ from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.frame import Pose
 from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.slam.optimization.reprojection import Prior
+from cohdc_train.slam.runtime.executors import SynchronousExecutor
 from cohdc_train.slam.tracking.flow_tracker import FlowTracker, Followed
 from cohdc_train.slam.tracking.motion_model import Prediction
 from cohdc_train.slam.tracking.tracker import Tracker
@@ -38,7 +38,7 @@ class Watched:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, flow: bool = True) -> None:
         method = Method(flow=flow, global_adjustment=False, smoothing=False)
         self.spent = 0.0
-        self.tracker = Tracker(CAMERA, 500, method=method, executor=AtOnce(), spent=lambda: self.spent)
+        self.tracker = Tracker(CAMERA, 500, method=method, executor=SynchronousExecutor(), spent=lambda: self.spent)
         self.searched: list[int] = []
         self.poses: list[Pose] = []
         find = self.tracker._extract.find
@@ -188,7 +188,7 @@ def test_the_same_frames_give_the_same_bits(views: list[View], monkeypatch: pyte
 
 def test_flow_belongs_to_real_time() -> None:
     assert Tracker(CAMERA, 500)._flow is None
-    assert Tracker(CAMERA, 500, executor=AtOnce())._flow is not None
+    assert Tracker(CAMERA, 500, executor=SynchronousExecutor())._flow is not None
 
 
 def test_where_flow_finds_too_little_the_frame_is_matched(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +241,7 @@ def test_flow_sets_out_from_where_the_motion_leads(monkeypatch: pytest.MonkeyPat
 
 def begun(view: View) -> tuple[FlowTracker, Tracker]:
     """A flow that sets out from the first frame of a map."""
-    tracker = Tracker(CAMERA, 500, executor=AtOnce())
+    tracker = Tracker(CAMERA, 500, executor=SynchronousExecutor())
     tracker.track(view[0], view[1], 0.0)
     assert tracker._flow is not None
     return tracker._flow, tracker

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """How `cohdc slam`'s memory and time grow over minutes: a recorded sequence, played forth and back, synchronously.
 
-    tools/slam_memory --sequence DIR --out OUT [--frames 18000] [--features 500] [--shrink 2] [--method KEY=VALUE ...]
+    tools/experiments/slam_memory.py --sequence DIR --out OUT [--frames 18000] [--features 500]
+        [--shrink 2] [--method KEY=VALUE ...]
 
 Frames come at 30 a second, images a --shrink-th as wide and high; they are read into memory first. A line every
 --every frames: resident memory beyond that before the first frame, keyframes and points the map holds, keyframes made
@@ -20,15 +21,14 @@ import cv2
 import numpy as np
 from slam_method import add_method_option
 
-from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.frame import FrameRecord
-from cohdc_train.slam.run import run_source
+from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.sources import Recorded
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.run import run_source
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
 from cohdc_train.trajectory.association import associate
+from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
 
 RATE = 30  # frames per second
 

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """The person networks of the HDC-Net family, from photographs and rendered people to a scored int8 file.
 
-    tools/person_model n --data COCO_SMALL --out DIR [--weights BACKBONE.pth | --pretrained person [--mean]]
+    tools/experiments/person_model.py n --data COCO_SMALL --out DIR
+        [--weights BACKBONE.pth | --pretrained person [--mean]]
 
 Renders DIR/synth and, with people close to the camera, DIR/near, trains DIR/fit, exports DIR/person.onnx and
 person.int8.onnx, calibrated on training photographs, and writes the scores of both on the validation

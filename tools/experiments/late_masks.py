@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """What real time costs without a clock: masks that are late by so many frames, and optical flow between matched frames.
 
-    tools/late_masks --sequences SEQUENCE ... --out OUT [--model person] [--late 0 3] [--features 1475 1500 1525]
+    tools/experiments/late_masks.py --sequences SEQUENCE ... --out OUT [--model person]
+        [--late 0 3] [--features 1475 1500 1525]
 
 Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done at once, no frame is dropped, and the
 segmenter always takes --late frames: the same numbers on every machine. `--method flow=false` matches every frame, as
@@ -14,26 +15,24 @@ import statistics
 from collections.abc import Callable
 from pathlib import Path
 
-from at_once import AtOnce
 from slam_method import add_method_option
 
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.slam.runtime.async_masks import Outline
-from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job
-from cohdc_train.slam.geometry.calibration import choose_camera
+from cohdc_train.slam.config import Culling, Method
+from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
-from cohdc_train.slam.config import Culling
 from cohdc_train.slam.dynamics.masks import Mask, grow
-from cohdc_train.slam.config import Method
-from cohdc_train.slam.runtime.threads import one_thread
-from cohdc_train.slam.dynamics.mask_propagation import halve_mask
-from cohdc_train.slam.io.sources import Recorded, rgbd_layout
 from cohdc_train.slam.frame import View
+from cohdc_train.slam.geometry.calibration import choose_camera
+from cohdc_train.slam.io.sources import Recorded, rgbd_layout
+from cohdc_train.slam.runtime.async_masks import Outline
+from cohdc_train.slam.runtime.executors import SynchronousExecutor
+from cohdc_train.slam.runtime.threads import one_thread
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 from cohdc_train.trajectory.evaluate import score
+from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 
 class LateMasks:
@@ -89,7 +88,7 @@ def opened(folder: Path, model: Path | None) -> tuple[Recorded, Outline]:
 def error(source: Recorded, masks: Callable[[View], Mask], features: int, method: Method) -> float:
     """ATE RMSE, m."""
     with one_thread():
-        tracker = Tracker(source.camera, features, 0, method, AtOnce())
+        tracker = Tracker(source.camera, features, 0, method, SynchronousExecutor())
         for view in source:
             tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
         tracker.finish()

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Size and speed of network designs before any is trained: random weights, one class, from image to masks.
 
-    tools/designs --out DIR [--designs R50 n ...] [--canvas 480 640] [--threads 1] [--pictures 6]
+    tools/experiments/designs.py --out DIR [--designs R50 n ...] [--canvas 480 640] [--threads 1] [--pictures 6]
 
 Every design is written as ONNX, in float32 and int8, and all files take turns on the same pictures. A random network
 finds as many objects as its padding holds, so that the time is that of a full picture. Times are shares of the first
@@ -17,11 +17,10 @@ import yaml
 
 from cohdc_train.bench.speed import frame_rates, runners_of
 from cohdc_train.exporter.graph import count_flops, write_graph
-from cohdc_train.exporter.sample_images import drawn_images
 from cohdc_train.exporter.quantization import quantize
+from cohdc_train.exporter.sample_images import drawn_images
 from cohdc_train.files import write_json, write_text
-from cohdc_train.models import MaskRCNN
-from cohdc_train.models import NetworkConfig
+from cohdc_train.models import MaskRCNN, NetworkConfig
 from cohdc_train.presets import config_path
 
 PLAIN, HDC = ((1,),) * 4, ((1, 2, 3),) * 4

@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
 """Ablations of the network: HDC's rates on the same weights, and the CQE head's fusions, targets and uses.
 
-    tools/ablations hdc --data ROOT [ROOT ...] --out DIR [--seeds 0 1 2] [--jobs 2] [-- OPTIONS OF cohdc fit]
-    tools/ablations cqe --data ROOT [ROOT ...] --out DIR ...
+    tools/experiments/ablations.py hdc --data ROOT [ROOT ...] --out DIR [--seeds 0 1 2] [--jobs 2]
+        [-- OPTIONS OF cohdc fit]
+    tools/experiments/ablations.py cqe --data ROOT [ROOT ...] --out DIR ...
 
 The first ROOT's val split is scored. Every variant has the same data, seeds and budget. Writes STUDY.md and STUDY.json
 to DIR; a second call goes on where the first was stopped.

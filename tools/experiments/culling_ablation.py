@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """What CQE's quality is worth to SLAM: bands of doubt by quality, bands alike, and the paper's filter at 0.9.
 
-    tools/culling_ablation --sequences DIR [DIR ...] --out OUT [--model person] [--seeds 0 1 2] [--method KEY=VALUE ...]
+    tools/experiments/culling_ablation.py --sequences DIR [DIR ...] --out OUT [--model person]
+        [--seeds 0 1 2] [--method KEY=VALUE ...]
 
 The model segments every frame once; the masks that each way of culling makes of that are written as PNGs, and
 `cohdc slam` runs on them. The bands that are alike are as wide as those by quality are on average. A sequence has true
@@ -22,14 +23,13 @@ from slam_method import add_method_option
 
 from cohdc_train.files import write_json, write_text
 from cohdc_train.presets import model_path
-from cohdc_train.segmenter import Detections
-from cohdc_train.segmenter import Segmenter
-from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.dynamics.mask_sources import dynamic_mask, dynamic_objects, growth
+from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.slam.config import Culling
-from cohdc_train.slam.run import slam
+from cohdc_train.slam.dynamics.mask_sources import dynamic_mask, dynamic_objects, growth
+from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded, rgbd_layout
 from cohdc_train.slam.io.tum import read_mask
+from cohdc_train.slam.run import slam
 
 Row = dict[str, Any]
 BY_QUALITY = Culling(doubt=1.0)

@@ -1,4 +1,4 @@
-"""Trainings of tools/table3 and tools/ablations, each in its own process; what is scored once is not trained again.
+"""Trainings of the experiments, each in its own process; what is scored once is not trained again.
 
 Imported by the tools beside it; runs the checkout's `cohdc fit` and `cohdc validate` with the present interpreter.
 """
@@ -14,7 +14,7 @@ from cohdc_train.bench.training import call, train
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import write_json
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 Scores = dict[str, float]
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How well a true mask is carried on by flow and depth, against the true mask of the frame where it arrives.
 
-    tools/carried_masks --sequences SEQUENCE ... --out OUT [--steps 1 3 6 10]
+    tools/experiments/carried_masks.py --sequences SEQUENCE ... --out OUT [--steps 1 3 6 10]
 
 Every --every-th frame's mask, of the TUM-format sequence's folder `masks`, is carried on through those that follow,
 where there is anybody in it.
@@ -17,11 +17,11 @@ import numpy as np
 
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
-from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.dynamics.mask_sources import MaskFolder
 from cohdc_train.slam.config import Culling
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.dynamics.mask_propagation import Half, Propagation, halve, halve_mask
+from cohdc_train.slam.dynamics.mask_sources import MaskFolder
+from cohdc_train.slam.dynamics.masks import Mask
+from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded
 
 

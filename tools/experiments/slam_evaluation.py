@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Dynamic SLAM scored on rendered sequences whose truth is exact: walks, carts, crowds, a loop, plain walls and more.
 
-    tools/slam_evaluation --root DIR --out OUT [--model person] [--seeds 0 1 2] [--method loops=false ...]
+    tools/experiments/slam_evaluation.py --root DIR --out OUT [--model person] [--seeds 0 1 2]
+        [--method loops=false ...]
 
 Renders what is missing of the sequences below DIR (12 of --frames frames, the loop twice as long), then runs
 `cohdc slam` in process on each: without masks ("none"), with the true people ("masks"), with whatever truly moves

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """The paper's Table 3, any set of its columns, at a stated scale: measured scores beside the paper's.
 
-    tools/table3 --data ROOT --out DIR [--tests 1 2 7 8 9 10] [--seeds 0 1 2] [--epochs 0.05] [--side 0.25] [--jobs 2]
+    tools/experiments/table3.py --data ROOT --out DIR [--tests 1 2 7 8 9 10] [--seeds 0 1 2]
+        [--epochs 0.05] [--side 0.25] [--jobs 2]
 
 --epochs and --side scale the columns' epochs and image sides (anchors with them); the columns' image counts are scaled
 so that the largest, 1014 + 180, becomes all there is. What follows `--` goes to every `cohdc fit`, such as a smaller

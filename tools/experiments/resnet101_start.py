@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """A start for ResNet-101 where only ResNet-50's ImageNet weights can be had: the blocks that both have, and copies.
 
-    tools/resnet101_start RESNET50.pth OUT.pth
+    tools/experiments/resnet101_start.py RESNET50.pth OUT.pth
 
 ResNet-101 has 17 blocks more in layer3. Each starts as ResNet-50's last block there, its residual scaled to a tenth, so
 that the network begins near ResNet-50. These are not ImageNet weights of ResNet-101, and a table says so.

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Ways to simplify outlines, on real masks: vertices, IoU, Boundary IoU, time and file size.
 
-    tools/contours --out DIR [--data NAME=COCO_FOLDER ...] [--model FILE --photos FOLDER] [--count 300] [--seed 0]
+    tools/experiments/contours.py --out DIR [--data NAME=COCO_FOLDER ...]
+        [--model FILE --photos FOLDER] [--count 300] [--seed 0]
 
 Sources: people that `cohdc synth` renders, the annotated objects of every COCO folder, and the masks that a model finds
 in a folder's images. `count` of each are drawn by the seed among those of at least 400 px. `dp` has one tolerance per
@@ -20,11 +21,7 @@ import cv2
 import numpy as np
 import torch
 
-from cohdc_train.contour import Polygon
-from cohdc_train.contour import rasterize
-from cohdc_train.contour import simplify
-from cohdc_train.contour import trace
-from cohdc_train.contour import vertices
+from cohdc_train.contour import Polygon, rasterize, simplify, trace, vertices
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes, write_json, write_text
 from cohdc_train.models.cqe_targets import band_of, boundary_iou

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Table 4's real photographs: vehicles and people of two COCO-format folders as one folder of three classes.
 
-    tools/table4_data COCO_SMALL COAD_VEHICLES OUT
+    tools/experiments/table4_data.py COCO_SMALL COAD_VEHICLES OUT
 
 COCO's cars, buses and trucks become "vehicle", as the street photographs call them. Every other class is left out;
 photographs of nothing else stay, as background. Images are hard links where possible: do not edit them.

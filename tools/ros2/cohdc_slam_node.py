@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """A ROS 2 node around the SLAM runner: colour and aligned depth in; pose, path and mask out.
 
-    tools/ros2_node --ros-args -p model:=person -p out:=runs/robot \
+    tools/ros2/cohdc_slam_node.py --ros-args -p model:=person -p out:=runs/robot \
         -r color/image:=/camera/color/image_raw -r color/camera_info:=/camera/color/camera_info \
         -r depth/image:=/camera/aligned_depth_to_color/image_raw
 
@@ -32,13 +32,11 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 from cohdc_train.slam.config import MAX_KEYPOINTS
+from cohdc_train.slam.frame import FrameRecord, Pose, View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.live import Frame, Live
-from cohdc_train.slam.frame import Pose
-from cohdc_train.slam.frame import FrameRecord
 from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
 from cohdc_train.slam.run import run_source
-from cohdc_train.slam.frame import View
 from cohdc_train.slam.tracking.tracker import Tracker
 
 SLOP = 0.02  # s between the stamps of colour and depth
