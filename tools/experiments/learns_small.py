@@ -8,10 +8,10 @@ Two contenders train at a time, each in a process of its own with one thread, on
 
     shipped         cohdc fit SET --minutes M                       (README's command: starts from the shipped weights)
     imagenet        the same with --pretrained mobilenet_v2.pth
-    torchvision-LR-short   the next with a warm-up of 5 % of the budget: its own takes a third of six minutes
     torchvision-LR  torchvision's references/detection recipe, written in reference_loops.py: SGD .9, weight decay
                     1e-4, frozen norms and first two parts, horizontal flip, warm-up of its first epoch (at most 1000
                     steps), rate divided by ten at 16/26 and 22/26 of the budget; the same ImageNet weights and canvas
+    torchvision-LR-short   the same with a warm-up of 5 % of the budget: its own takes a third of six minutes
 
 All have the same network (networks/hdc_net_n.yaml), canvas and batch size. The clock of `cohdc fit` includes its
 validations; torchvision's clock stops while it is scored. The last weights of each are scored by pycocotools on the
