@@ -121,6 +121,8 @@ class CocoDataModule(pl.LightningDataModule):
         self.augment = augment
         self.mini_mask = mini_mask
         self.subset = subset
+        if overfit < 0:
+            raise DataError(f"overfit {overfit}: the number of images is not negative")
         self.overfit = overfit
         if overfit:
             self.augment = augment = Augmentation(flip=0.0, scale_jitter=(1.0, 1.0), photometric=False)

@@ -41,8 +41,13 @@ def auto_precision(accelerator: Any = "auto") -> _PRECISION_INPUT:
 def training_limits(trainer: dict[str, Any], epochs: int | None, minutes: float | None) -> dict[str, Any]:
     """Return the trainer's limits for `--epochs` and `--minutes`; whichever comes first ends the training.
 
-    trainer: arguments of the trainer, of which max_epochs, max_steps and max_time are read.
+    trainer: arguments of the trainer, of which max_epochs, max_steps and max_time are read. Raises ValueError for a
+    budget that is not positive.
     """
+    if epochs is not None and epochs < 1:
+        raise ValueError(f"--epochs {epochs}: at least 1")
+    if minutes is not None and minutes <= 0:
+        raise ValueError(f"--minutes {minutes:g}: must be above 0")
     limits: dict[str, Any] = {name: trainer[name] for name in ("max_epochs", "max_steps", "max_time")}
     if epochs is not None:
         limits["max_epochs"] = epochs

@@ -152,6 +152,8 @@ class FitCommand(LightningCLI):
         kwargs |= self._limits(config)
         if config["check_val_every_n_epoch"] is None and config["val_check_interval"] is None:
             kwargs |= validation_interval(kwargs)
+        elif config["check_val_every_n_epoch"] is None and isinstance(config["val_check_interval"], float):
+            kwargs["check_val_every_n_epoch"] = 1  # a share of an epoch
         if config["logger"] in (None, True):
             root = Path(self.config["out"])
             csv = CSVLogger(root, name="logs")

@@ -21,6 +21,12 @@ def test_minutes_and_epochs_are_trainer_limits() -> None:
     assert limits(minutes=6, max_epochs=12)["max_epochs"] == 12
 
 
+@pytest.mark.parametrize(("epochs", "minutes"), [(0, None), (None, 0.0), (None, -1.0)])
+def test_budget_that_is_not_positive_is_refused(epochs: int | None, minutes: float | None) -> None:
+    with pytest.raises(ValueError, match=r"--epochs 0: at least 1|--minutes .*: must be above 0"):
+        limits(epochs, minutes)
+
+
 def test_small_sets_get_more_epochs() -> None:
     assert [default_epochs(n) for n in (1, 40, 322, 100_000)] == [300, 150, 19, 12]
 
