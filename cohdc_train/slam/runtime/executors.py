@@ -24,6 +24,8 @@ def worker_process() -> Iterator[Executor]:
 
 def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
+    import scipy.linalg  # noqa: F401  with numpy's: the limit only reaches libraries that are loaded
+
     threadpool_limits(1, "blas")
     if hasattr(os, "nice"):
         os.nice(NICE)

@@ -1,7 +1,6 @@
 """The adjustment at the end, in which frames between keyframes count: what it is worth, and what it may not do."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,7 +134,7 @@ def test_a_frame_that_saw_little_is_not_kept(tracker: Tracker) -> None:
     fit, seen = tracker._last, ObservedFrames()
     assert fit is not None
     for points, wanted in ((2 * FEW - 1, False), (2 * FEW, True)):
-        few = replace(fit, matches=fit.matches.take(np.arange(points)))
+        few = fit.matches.take(np.arange(points))
         assert (seen.chosen(few, matched=True) is not None) == wanted
 
 
