@@ -33,7 +33,7 @@ RENAMED_OPTIONS = {
     "--method.flow": "--settings.flow.enabled",
 }
 # Where a program lies, the newest place first, relative to a checkout.
-_TOOL_PLACES = {"late_masks": ("tools/experiments/late_masks.py", "tools/experiments/late_masks.py")}
+_TOOL_PLACES = {"late_masks": ("tools/experiments/late_masks.py", "tools/late_masks")}
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
