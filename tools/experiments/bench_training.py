@@ -47,6 +47,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--data", type=Path, required=True, help="COCO-format folder")
     parser.add_argument("--classes", nargs="*", help="these classes only")
     parser.add_argument("--canvas", type=int, nargs=2, default=(320, 416), metavar=("H", "W"), help="px, of both sides")
+    parser.add_argument("--network", help="YAML file of both sides' network, such as networks/hdc_net_n.yaml")
     parser.add_argument("--weights", help="ImageNet weights of both backbones: a torchvision name or a file")
     parser.add_argument("--checkpoint", type=Path, help="weights of both sides in validation, by cohdc fit")
     parser.add_argument("--onnx", type=Path, help="the checkpoint's file, by cohdc export, for the phase `file`")
@@ -69,8 +70,15 @@ def options() -> argparse.Namespace:
 
 def network_config(args: argparse.Namespace) -> Any:
     """The network of both sides: that of the checkpoint, or a slim ResNet-18 with HDC."""
-    from cohdc_train.models import NetworkConfig
+    import yaml
 
+    from cohdc_train.models import NetworkConfig
+    from cohdc_train.presets import config_path
+
+    if args.network:
+        fields = yaml.safe_load(config_path(args.network).read_text(encoding="utf-8"))["model"]["network"]
+        own = {"weights": args.weights, "norm": "frozen", "frozen_stages": 2, "canvas": tuple(args.canvas)}
+        return NetworkConfig(**{**fields, **own, "cqe": args.cqe})
     return NetworkConfig(
         **{"depth": 18, "rates": ((1,), (1,), (1, 2, 3), (1, 2, 3)), "weights": args.weights, "norm": "frozen"},
         **{"frozen_stages": 2, "canvas": tuple(args.canvas), "anchor_scales": (16, 32, 64, 128, 256), "cqe": args.cqe},
