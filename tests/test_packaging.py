@@ -156,7 +156,5 @@ def test_checker_follows_a_dockerfile(tmp_path: Path, monkeypatch: pytest.Monkey
 
 @pytest.mark.slow
 def test_slam_dockerfile_installs_in_a_clean_environment() -> None:
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "tools" / "check_docker"), "slam"], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, str(ROOT / ".ci" / "check_docker"), "slam"], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]

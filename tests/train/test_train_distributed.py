@@ -28,7 +28,10 @@ EXACT: dict[str, Any] = {
         },
         "optimizer": {"name": "sgd", "lr": 0.02, "warmup_steps": 0},
     },
-    "trainer": {"accelerator": "cpu", "enable_model_summary": False, "enable_progress_bar": False, "logger": False},
+    "trainer": {
+        **{"accelerator": "cpu", "precision": "32-true", "logger": False},
+        **{"enable_model_summary": False, "enable_progress_bar": False},
+    },
 }
 
 
