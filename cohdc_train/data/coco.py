@@ -120,7 +120,9 @@ def read_folder(
     """
     paths = paths or CocoPaths()
     if not roots and (paths.train_json is None or paths.val_json is None):
-        raise DataError("no data: give data.root, or data.paths with train_json, train_images, val_json and val_images")
+        raise DataError(
+            "no data: give a folder (cohdc fit DATA) or data.paths: train_json, train_images, val_json and val_images"
+        )
     found = [paths.split("train") or find_split(roots[0], "train"), *(find_split(r, "train") for r in roots[1:])]
     train = [read_split("train", files, classes) for files in found]
     names = train[0].class_names

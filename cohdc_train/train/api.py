@@ -31,6 +31,7 @@ def fit(
 
     Raises:
         CohdcError: in one line, for whatever the user can fix.
+        SystemExit: an override is no option of `cohdc fit`, or of another type; the message is on stderr.
     """
     roots = [data] if isinstance(data, Path | str) else list(data)
     configs = [config] if isinstance(config, Path | str) else list(config)

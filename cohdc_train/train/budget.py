@@ -86,6 +86,9 @@ def validation_interval(limits: dict[str, Any]) -> dict[str, Any]:
 def _as_timedelta(value: Any) -> timedelta:
     """Return a duration from Lightning's forms: timedelta, "DD:HH:MM:SS", or a dict of its fields."""
     if isinstance(value, str):
-        days, hours, minutes, seconds = (int(part) for part in value.split(":"))
+        parts = value.split(":")
+        if len(parts) != 4 or not all(part.isdigit() for part in parts):
+            raise ValueError(f"--trainer.max_time {value}: give DD:HH:MM:SS, such as 00:00:10:00, or --minutes 10")
+        days, hours, minutes, seconds = (int(part) for part in parts)
         return timedelta(days=days, hours=hours, minutes=minutes, seconds=seconds)
     return timedelta(**value) if isinstance(value, dict) else value

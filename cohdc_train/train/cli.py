@@ -1,11 +1,14 @@
 """`cohdc fit`: Lightning's command line with this project's defaults."""
 
+import json
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
@@ -39,6 +42,7 @@ _DESCRIPTION = (
     "which starts from the shipped weights."
 )
 _DEFAULT_NETWORK = "networks/hdc_net_n.yaml"
+_NETWORK_NAMES = ("backbone", "depth")  # fields that say which network is meant
 _BEST = "val/segm_AP"
 _OVERFIT_STEPS = 300
 # Lightning's advice that does not apply here, and what its own code is told off for by newer packages.
@@ -217,7 +221,7 @@ class FitCommand(LightningCLI):
         ):
             return
         trainer.validate(module, datamodule=self.datamodule, verbose=False)
-        best = next(c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint) and c.monitor == _BEST)
+        best = self._best_checkpoint()
         score = module.results.scores["segm_AP"]
         if best.best_model_score is None or score > best.best_model_score:
             trainer.save_checkpoint(Path(self.config["out"]) / "best.ckpt")
@@ -230,8 +234,13 @@ class FitCommand(LightningCLI):
         if self.config["overfit"]:
             print(overfit_verdict(facts.scores, self.config["overfit"]))
             return
-        for line in summary_lines(facts, Path(self.config["out"])):
+        best = self._best_checkpoint().best_model_score
+        for line in summary_lines(facts, Path(self.config["out"]), None if best is None else float(best)):
             print(line)
+
+    def _best_checkpoint(self) -> ModelCheckpoint:
+        """Return the callback that keeps best.ckpt."""
+        return next(c for c in self.trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint) and c.monitor)
 
     def _choose_batch_size(self) -> None:
         if self.trainer.world_size > 1:
@@ -245,8 +254,23 @@ def _num_images(data: CocoDataModule) -> int:
 
 
 def _keep_last(folder: Path) -> ModelCheckpoint:
-    """`last.ckpt` after every epoch. ModelCheckpoint's own `save_last` writes it only when the best one changes."""
-    return ModelCheckpoint(folder, "last", save_top_k=1, save_on_train_epoch_end=True, enable_version_counter=False)
+    """Write `last.ckpt` after every epoch, and when the training is interrupted.
+
+    ModelCheckpoint's own `save_last` writes it only when the best one changes.
+    """
+    return LastCheckpoint(folder, "last", save_top_k=1, save_on_train_epoch_end=True, enable_version_counter=False)
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """`last.ckpt`, also of a training that Ctrl-C or an error ended."""
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Save where the training is, and say how it goes on."""
+        if trainer.global_step == 0 or self.dirpath is None or isinstance(exception, CohdcError):
+            return
+        path = Path(self.dirpath) / "last.ckpt"
+        trainer.save_checkpoint(path)
+        rank_zero_info(f"interrupted at step {trainer.global_step}; --ckpt_path {path} goes on from there")
 
 
 class _SaveConfig(SaveConfigCallback):
@@ -255,22 +279,25 @@ class _SaveConfig(SaveConfigCallback):
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         root = Path(trainer.default_root_dir)
         root.mkdir(parents=True, exist_ok=True)
-        self.parser.save(self.config, root / "config.yaml", skip_none=False, overwrite=True, multifile=False)
+        config = self.config.clone()
+        config["ckpt_path"] = None  # the file repeats a training, and does not resume one
+        self.parser.save(config, root / "config.yaml", skip_none=False, overwrite=True, multifile=False)
 
 
 def _resolve_arguments(args: list[str]) -> list[str]:
     """Return the arguments with leading folders as `--data.root` and shipped configs as files.
 
-    Without a config and without an option of the network, the default network is put before them.
+    Where neither a config nor an option names a network, the default network comes first.
     """
     roots: list[str] = []
     while args and not args[0].startswith("-"):
         roots, args = [*roots, args[0]], args[1:]
     resolved: list[str] = []
-    if not any(arg.startswith(("--config", "-c", "--model.network.")) for arg in args):
+    if not _names_network(args):
+        rank_zero_info(f"network: {_DEFAULT_NETWORK}")
         resolved += ["--config", str(config_path(_DEFAULT_NETWORK))]
     if roots:
-        resolved.append(f"--data.root={roots[0] if len(roots) == 1 else '[' + ','.join(roots) + ']'}")
+        resolved.append(f"--data.root={roots[0] if len(roots) == 1 else json.dumps(roots)}")
     for arg in args:
         name, separator, value = arg.partition("=")
         if resolved and resolved[-1] in ("--config", "-c"):
@@ -279,6 +306,20 @@ def _resolve_arguments(args: list[str]) -> list[str]:
             arg = f"{name}={config_path(value)}"
         resolved.append(arg)
     return resolved
+
+
+def _names_network(args: list[str]) -> bool:
+    """Return whether an option, or a config behind `--config`, says which backbone the network has."""
+    if any(arg.startswith(tuple(f"--model.network.{name}" for name in _NETWORK_NAMES)) for arg in args):
+        return True
+    paths = [following for arg, following in pairwise(args) if arg in ("--config", "-c")]
+    paths += [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
+    for path in paths:
+        content = yaml.safe_load(config_path(path).read_text(encoding="utf-8")) or {}
+        network = (content.get("model") or {}).get("network") or {}
+        if any(name in network for name in _NETWORK_NAMES):
+            return True
+    return False
 
 
 @contextmanager

@@ -19,7 +19,7 @@ SHIPPED = "person"  # the shipped network that networks of its layers start from
 _SHIPPED_CONFIG = "networks/hdc_net_n.yaml"
 _PUBLISHED = "IMAGENET1K_V1"
 # Fields of NetworkConfig that decide which layers there are, and their shapes.
-_SHAPE = ("backbone", "depth", "width", "finest_stride", "fpn_channels", "fc", "cqe", "mask_size", "head_norm")
+SHAPE_FIELDS = ("backbone", "depth", "width", "finest_stride", "fpn_channels", "fc", "cqe", "mask_size", "head_norm")
 
 Network = Mapping[str, Any]  # the fields of NetworkConfig by name
 
@@ -65,7 +65,10 @@ def choose_initial_weights(pretrained: str, network: Network, resumed: Path | No
         CohdcError: there is no such file, or it cannot be read; one line names the flag.
     """
     if resumed is not None:
-        return InitialWeights("resumed", str(resumed), stored=_read_weights(resumed).get("hyper_parameters", {}))
+        stored = _read_weights(resumed)
+        if "hyper_parameters" not in stored or "loops" not in stored:
+            raise CohdcError(f"{resumed}: not a checkpoint of cohdc fit; --pretrained takes weights of other kinds")
+        return InitialWeights("resumed", str(resumed), stored=stored["hyper_parameters"])
     if pretrained == "none":
         return InitialWeights("random", norm="batch", reason="--pretrained none")
     if pretrained == "imagenet":
@@ -148,8 +151,7 @@ def _read_weights(path: Path) -> dict[str, Any]:
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
-        reason = str(error).partition("\n")[0]
-        raise CohdcError(f"{path}: neither a checkpoint nor a state dict: {reason}") from error
+        raise CohdcError(f"{path}: neither a checkpoint nor a state dict ({type(error).__name__})") from error
     if not isinstance(stored, dict):
         raise CohdcError(f"{path}: neither a checkpoint nor a state dict: it holds a {type(stored).__name__}")
     return stored
@@ -159,5 +161,5 @@ def _has_layers_of_shipped(network: Network) -> bool:
     """Return whether the shipped network's weights fit: the same layers of the same shapes, but for the classes."""
     fields = yaml.safe_load(config_path(_SHIPPED_CONFIG).read_text(encoding="utf-8"))["model"]["network"]
     shipped = NetworkConfig(**fields)
-    names = [name for name in _SHAPE if name != "depth" or network["backbone"] == "resnet"]
+    names = [name for name in SHAPE_FIELDS if name != "depth" or network["backbone"] == "resnet"]
     return network["norm"] != "batch" and all(network[name] == getattr(shipped, name) for name in names)

@@ -13,6 +13,7 @@ from cohdc_train.data.datamodule import CocoDataModule, TrainBatch, ValSample
 from cohdc_train.errors import CohdcError
 from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
+from cohdc_train.train.initial_weights import SHAPE_FIELDS
 from cohdc_train.train.onnx_weights import load_exported, read_exported
 from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, training_progress
 
@@ -100,8 +101,8 @@ class MaskRCNNModule(pl.LightningModule):
             for name, weights in theirs.items()
             if name in own and own[name].shape == weights.shape and not name.startswith(specific)
         }
-        if not fitting:
-            raise CohdcError(f"{path}: none of its {len(theirs)} weights fits this network")
+        if not any(name.startswith("backbone.body.") for name in fitting):
+            raise CohdcError(f"{path}: none of the weights of its backbone fits this network; give --config of its own")
         self.network.load_state_dict(fitting, strict=False)
         return [name for name in own if name not in fitting]
 
@@ -172,6 +173,14 @@ class MaskRCNNModule(pl.LightningModule):
         if theirs != self.class_names:
             ours = ", ".join(self.class_names)
             raise CohdcError(f"the checkpoint's classes are {', '.join(theirs)}; the data's are {ours}")
+        network = checkpoint.get("hyper_parameters", {}).get("network", {})
+        for name in SHAPE_FIELDS:
+            own = getattr(self.network_config, name)
+            if network.get(name, own) != own:
+                raise CohdcError(
+                    f"the checkpoint's network has {name} {network[name]}, this one {own}; "
+                    "give --config of its training, the config.yaml next to it"
+                )
 
     def _data(self) -> CocoDataModule:
         data = self.trainer.datamodule  # type: ignore[attr-defined]

@@ -36,11 +36,14 @@ class ProgressReporter(pl.Callback):
         self._figures = figures
         self._stamps: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._started = 0.0
+        self._progress_before = 0.0  # share of the budget that earlier sessions used
         self._paused = 0.0  # start of a validation, s
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start the clock."""
         self._started = time.monotonic()
+        progress = training_progress(trainer, trainer.estimated_stepping_batches)
+        self._progress_before = 0.0 if progress is None else progress(trainer.global_step)
         self._stamps.append((self._started, self.images_seen))
 
     def on_train_batch_end(
@@ -73,6 +76,15 @@ class ProgressReporter(pl.Callback):
         self._print(self.line(trainer, pl_module.results.scores))
         self._log_figure(trainer)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed training goes on counting from."""
+        return {"losses": self.losses, "images_seen": self.images_seen}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the counts of an earlier session."""
+        self.losses = list(state_dict["losses"])
+        self.images_seen = int(state_dict["images_seen"])
+
     def images_per_s(self) -> float:
         """Return training images per second over the last steps; 0 before the first."""
         (first, before), (last, after) = self._stamps[0], self._stamps[-1]
@@ -82,9 +94,10 @@ class ProgressReporter(pl.Callback):
         """Return the estimated rest of the training, min; None where it is unknown."""
         progress = training_progress(trainer, trainer.estimated_stepping_batches)
         used = None if progress is None else progress(trainer.global_step)
-        if not used:
+        if used is None or used <= self._progress_before:
             return None
-        return (time.monotonic() - self._started) * (1 - min(1.0, used)) / used / 60
+        elapsed = time.monotonic() - self._started
+        return elapsed * (1 - min(1.0, used)) / (used - self._progress_before) / 60
 
     def line(self, trainer: pl.Trainer, scores: dict[str, float]) -> str:
         """Return one line on the training so far."""

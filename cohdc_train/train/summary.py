@@ -18,6 +18,7 @@ from cohdc_train.train.progress import ProgressReporter
 LOW_AP50 = 0.05
 MANY_SMALL = 0.3  # share of objects below the anchors from which the canvas is too small
 _SMALL_BATCH = 8  # images below which BatchNorm's statistics are noise
+_FILES = ("best.ckpt", "last.ckpt", "config.yaml", "pictures", "logs")
 _PART = 5  # the first and the last fifth of the losses are compared
 
 
@@ -83,8 +84,11 @@ def training_facts(
     )
 
 
-def summary_lines(facts: TrainingFacts, out: Path) -> list[str]:
-    """Return the last lines of a training. out: its folder."""
+def summary_lines(facts: TrainingFacts, out: Path, best_ap: float | None = None) -> list[str]:
+    """Return the last lines of a training.
+
+    out: its folder; best_ap: mask AP of best.ckpt, which may be of an earlier session.
+    """
     scores = facts.scores
     lines = [f"best.ckpt: mask AP {scores['segm_AP']:.3f}, AP50 {scores['segm_AP50']:.3f} on the validation split"]
     per_class = [
@@ -93,8 +97,13 @@ def summary_lines(facts: TrainingFacts, out: Path) -> list[str]:
     if per_class:
         lines.append(f"mask AP per class: {', '.join(per_class)}")
     lines += [f"hint: {hint}" for hint in hints(facts)]
-    lines.append(f"files: {out / 'best.ckpt'}, last.ckpt, config.yaml, pictures/, logs/")
-    lines.append(f"next:  cohdc export {out / 'best.ckpt'} --images {facts.images[0].path.parent}")
+    if best_ap is not None and best_ap > scores["segm_AP"] + 1e-6:
+        lines[0] = f"best.ckpt: mask AP {best_ap:.3f}, of an earlier session; this one reached {scores['segm_AP']:.3f}"
+    files = [name for name in _FILES if (out / name).exists()]
+    if files:
+        lines.append(f"files in {out}: {', '.join(files)}")
+    if "best.ckpt" in files:
+        lines.append(f"next: cohdc export {out / 'best.ckpt'} --images {facts.images[0].path.parent}")
     return lines
 
 

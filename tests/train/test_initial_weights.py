@@ -90,7 +90,7 @@ def test_files_are_told_apart_by_their_content(tmp_path: Path) -> None:
 def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
     last = tmp_path / "last.ckpt"
     hyper = {"network": {"norm": "frozen", "frozen_stages": 3}, "optimizer": {"backbone_lr": 0.2}}
-    torch.save({"hyper_parameters": hyper, "state_dict": {}}, last)
+    torch.save({"hyper_parameters": hyper, "state_dict": {}, "loops": {}}, last)
     network = fields("resnet50")
     initial = choose_initial_weights("auto", network, last)
     assert initial.kind == "resumed"
@@ -98,6 +98,13 @@ def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
     assert "norm" not in resolve_network(initial, fields("resnet50", norm="batch"))
     assert resolve_backbone_lr(initial, None) == 0.2
     assert resolve_backbone_lr(initial, 0.7) == 0.7
+
+
+def test_state_dict_is_refused_as_a_checkpoint_to_resume(tmp_path: Path) -> None:
+    state = tmp_path / "state.pth"
+    torch.save({"conv1.weight": torch.zeros(1)}, state)
+    with pytest.raises(CohdcError, match=r"state\.pth: not a checkpoint of cohdc fit; --pretrained takes"):
+        choose_initial_weights("auto", fields("resnet50"), state)
 
 
 def test_backbone_learns_slower_from_trained_weights() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from cohdc_train.data.annotations import CocoImage, CocoObject
 from cohdc_train.models import NetworkConfig
+from cohdc_train.train.sanity import suggest_rate
 from cohdc_train.train.summary import TrainingFacts, hints, summary_lines
 
 
@@ -53,11 +54,34 @@ def test_each_fault_has_its_hint(changes: dict[str, Any], words: list[str]) -> N
         assert word in hint
 
 
-def test_summary_names_scores_files_and_next_command() -> None:
-    lines = summary_lines(HEALTHY, Path("runs/fit"))
-    assert lines == [
+def test_summary_names_scores_files_and_next_command(tmp_path: Path) -> None:
+    (tmp_path / "best.ckpt").touch()
+    (tmp_path / "logs").mkdir()
+    assert summary_lines(HEALTHY, tmp_path) == [
         "best.ckpt: mask AP 0.300, AP50 0.600 on the validation split",
         "mask AP per class: person 0.400, car 0.200",
-        "files: runs/fit/best.ckpt, last.ckpt, config.yaml, pictures/, logs/",
-        "next:  cohdc export runs/fit/best.ckpt --images photos",
+        f"files in {tmp_path}: best.ckpt, logs",
+        f"next: cohdc export {tmp_path / 'best.ckpt'} --images photos",
     ]
+
+
+def test_summary_tells_a_better_checkpoint_of_an_earlier_session(tmp_path: Path) -> None:
+    (first, *_) = summary_lines(HEALTHY, tmp_path, best_ap=0.335)
+    assert first == "best.ckpt: mask AP 0.335, of an earlier session; this one reached 0.300"
+    (same, *_) = summary_lines(HEALTHY, tmp_path, best_ap=0.3)
+    assert same.startswith("best.ckpt: mask AP 0.300, AP50")
+
+
+@pytest.mark.parametrize(
+    ("losses", "suggestion"),
+    [
+        ([2.0] * 50 + [1.0] + [3.0] * 49, 0.1 * 50 / 10),
+        ([2.0] * 100, None),
+        ([2.0] * 50 + [1.9] + [3.0] * 49, None),
+        ([2.0, 1.0], None),
+    ],
+)
+def test_range_test_suggests_a_tenth_of_the_best_rate(losses: list[float], suggestion: float | None) -> None:
+    rates = [0.1 * step for step in range(len(losses))]
+    found = suggest_rate(rates, losses)
+    assert found == (None if suggestion is None else pytest.approx(suggestion))

@@ -28,7 +28,7 @@ TABLE = {
 @pytest.mark.parametrize("test", TABLE)
 def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
     train, val, epochs, (width, height), mini, scale, lr, pretrained = TABLE[test]
-    network: dict[str, Any] = {"anchor_scales": [scale, 2 * scale, 4 * scale, 8 * scale]}
+    network: dict[str, Any] = {"backbone": "resnet", "anchor_scales": [scale, 2 * scale, 4 * scale, 8 * scale]}
     if pretrained:
         network["weights"] = "IMAGENET1K_V1"
     expected: dict[str, Any] = {

@@ -124,8 +124,8 @@ def test_training_ends_with_scores_files_and_the_next_command(
     assert re.search(r"^best\.ckpt: mask AP \d\.\d{3}, AP50 \d\.\d{3} on the validation split$", end, re.M)
     assert re.search(r"^mask AP per class: person \d\.\d{3}, car \d\.\d{3}$", end, re.M)
     assert re.search(r"^hint: AP50 is 0\.\d+ after 3 steps from random weights on 6 images", end, re.M)
-    assert f"files: {tmp_path / 'best.ckpt'}" in end
-    assert lines[-1] == f"next:  cohdc export {tmp_path / 'best.ckpt'} --images {toy / 'images'}"
+    assert f"files in {tmp_path}: best.ckpt, last.ckpt, config.yaml, logs" in end
+    assert lines[-1] == f"next: cohdc export {tmp_path / 'best.ckpt'} --images {toy / 'images'}"
     assert any(re.match(r"step 3; 6 images, .*loss .*lr .*mask AP .*AP50", line) for line in lines)
 
 
@@ -216,7 +216,7 @@ def test_a_checkpoint_without_a_fitting_weight_is_refused(run: Path) -> None:
     other = NetworkConfig(depth=50, width=0.25, fpn_channels=16, fc=32, anchor_scales=(8, 16, 32, 64))
     module = MaskRCNNModule(["dog"], other)
     module.network = torch.nn.ModuleDict({"another": torch.nn.Linear(1, 1)})  # type: ignore[assignment]
-    with pytest.raises(CohdcError, match=r"last\.ckpt: none of its \d+ weights fits"):
+    with pytest.raises(CohdcError, match=r"last\.ckpt: none of the weights of its backbone fits"):
         module.take_over(run / "last.ckpt")
 
 
@@ -392,3 +392,50 @@ def test_error_is_told_by_its_last_line(text: str, told: str) -> None:
     with pytest.raises(CohdcError) as error, told_in_one_line():
         raise CohdcError(text)
     assert str(error.value) == told
+
+
+def test_interrupted_training_keeps_its_last_step(
+    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    step = MaskRCNNModule.training_step
+
+    def interrupted(self: MaskRCNNModule, batch: Any, batch_idx: int) -> torch.Tensor:
+        if self.global_step == 2:
+            raise KeyboardInterrupt
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(MaskRCNNModule, "training_step", interrupted)
+    with pytest.raises((SystemExit, KeyboardInterrupt)):
+        fit(arguments(toy, tmp_path))
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 2
+
+
+def test_network_of_a_resumed_training_has_to_agree(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["fit", *arguments(toy, toy / "no", "--model.network.fc=32", f"--ckpt_path={run / 'last.ckpt'}")])
+    assert code == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "the checkpoint's network has fc 16, this one 32; give --config of its training" in last
+
+
+@pytest.mark.parametrize(
+    ("options", "backbone"),
+    [
+        (["--model.network.detections=7"], "mobilenet_v2"),
+        (["--config=person.yaml"], "mobilenet_v2"),
+        (["--model.network.depth=18"], "resnet"),
+        (["--config=networks/resnet50.yaml"], "resnet"),
+        (["--config", "table3/test01.yaml"], "resnet"),
+    ],
+)
+def test_default_network_gives_way_to_a_named_one(
+    options: list[str], backbone: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        fit(["DATA", *options, "--print_config"])
+    assert yaml.safe_load(capsys.readouterr().out)["model"]["network"]["backbone"] == backbone
+
+
+@pytest.mark.filterwarnings("ignore:The dirpath has changed")
+def test_repeated_configuration_does_not_resume(toy: Path, run: Path, tmp_path: Path) -> None:
+    fit(arguments(toy, tmp_path, "--trainer.max_epochs=2", f"--ckpt_path={run / 'last.ckpt'}"))
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["ckpt_path"] is None
