@@ -65,7 +65,7 @@ def test_explicit_paths_stand_alone_and_override(tmp_path: Path) -> None:
     assert len(read_folder([], paths=alone).train[0].images) == 4
     with pytest.raises(DataError, match="go together"):
         read_folder([root], paths=CocoPaths(val_json=other))
-    with pytest.raises(DataError, match=r"give data\.root"):
+    with pytest.raises(DataError, match=r"cohdc fit DATA"):
         read_folder([])
 
 
