@@ -122,8 +122,8 @@ class Backbone(nn.Module):
     """HDC stages and feature pyramid, under the names that torchvision's BackboneWithFPN uses."""
 
     def __init__(self, config: NetworkConfig) -> None:
+        """config: resolved, of MaskRCNN."""
         super().__init__()
-        config = config.resolved(pretrained=config.weights is not None)
         body_norm: Norm = "frozen" if config.norm == "frozen" else "batch"
         shape = (config.width, config.rates, body_norm, config.frozen_stages or 0)
         self.body: HDCResNet | MobileNetV1 | MobileNetV2

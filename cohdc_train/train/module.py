@@ -15,7 +15,7 @@ from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
 from cohdc_train.train.initial_weights import SHAPE_FIELDS
 from cohdc_train.train.onnx_weights import load_exported, read_exported
-from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, training_progress
+from cohdc_train.train.optimizer import OptimizerConfig, Progress, build_optimizer, training_progress
 
 _OF_CLASSES = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.", "cqe.quality.")
 MIN_CANVAS = 32  # px: one cell of the coarsest level that RoIs are pooled from
@@ -62,6 +62,7 @@ class MaskRCNNModule(pl.LightningModule):
         self._fused: list[MaskRCNN] = []  # while validation lasts; in a list it is no part of the module
         self.results: Results | None = None  # of the last validation
         self.validated_step = -1  # optimizer steps made before it
+        self.progress: Progress | None = None  # of the training, from the first step on
 
     @classmethod
     def load(cls, path: Path, canvas: tuple[int, int] | None = None) -> "MaskRCNNModule":
@@ -161,6 +162,7 @@ class MaskRCNNModule(pl.LightningModule):
         progress = training_progress(self.trainer, self.trainer.estimated_stepping_batches)
         if progress is None:
             raise CohdcError("the schedule needs an end: give --epochs, --minutes or --trainer.max_steps")
+        self.progress = progress
         # Fused saves a tenth of a step on a CPU; in mixed precision Lightning cannot clip its gradients.
         optimizer, schedule = build_optimizer(
             self.optimizer_config, self.network, progress, fused=self.trainer.precision == "32-true"

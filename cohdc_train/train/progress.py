@@ -12,7 +12,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.optimizer import training_progress
+from cohdc_train.train.optimizer import Progress
 
 _WINDOW = 30  # steps over which the speed is averaged
 _CLASSES = 5  # whose AP stands in the line
@@ -36,14 +36,15 @@ class ProgressReporter(pl.Callback):
         self._figures = figures
         self._stamps: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._started = 0.0
+        self._progress: Progress | None = None
         self._progress_before = 0.0  # share of the budget that earlier sessions used
         self._paused = 0.0  # start of a validation, s
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start the clock."""
         self._started = time.monotonic()
-        progress = training_progress(trainer, trainer.estimated_stepping_batches)
-        self._progress_before = 0.0 if progress is None else progress(trainer.global_step)
+        self._progress = pl_module.progress if isinstance(pl_module, MaskRCNNModule) else None
+        self._progress_before = 0.0 if self._progress is None else self._progress(trainer.global_step)
         self._stamps.append((self._started, self.images_seen))
 
     def on_train_batch_end(
@@ -92,8 +93,7 @@ class ProgressReporter(pl.Callback):
 
     def minutes_left(self, trainer: pl.Trainer) -> float | None:
         """Return the estimated rest of the training, min; None where it is unknown."""
-        progress = training_progress(trainer, trainer.estimated_stepping_batches)
-        used = None if progress is None else progress(trainer.global_step)
+        used = None if self._progress is None else self._progress(trainer.global_step)
         if used is None or used <= self._progress_before:
             return None
         elapsed = time.monotonic() - self._started

@@ -46,6 +46,7 @@ def match(groundtruth: Trajectory, estimate: Trajectory, max_difference: float =
 
 
 def nearest(stamps: FloatArray, wanted: FloatArray) -> NDArray[np.int64]:
+    """Return the row of the stamp nearest to each wanted time. stamps: [n], rising, s; wanted: [m], s."""
     after = np.minimum(np.searchsorted(stamps, wanted), len(stamps) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(wanted - stamps[before]) <= np.abs(stamps[after] - wanted), before, after)
