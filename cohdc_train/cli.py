@@ -1,4 +1,6 @@
-"""The table of verbs. A verb's module is imported when the verb is called, so that `cohdc --help` costs nothing."""
+"""The table of verbs. A verb's module is imported when the verb is called, so that `cohdc --help`
+costs nothing.
+"""
 
 import importlib
 import sys
@@ -17,19 +19,43 @@ class Verb(NamedTuple):
 
 
 VERBS = {
-    "demo": Verb("demo", "demo", "the whole way on a rendered room: data, training, ONNX, SLAM, scores, report"),
-    "data": Verb(
-        "data.commands", "COMMANDS", "look at a COCO-format folder, make one of other formats, fetch a TUM sequence"
+    "demo": Verb(
+        "demo",
+        "demo",
+        "the whole way on a rendered room: data, training, ONNX, SLAM, scores, report",
     ),
-    "synth": Verb("synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"),
+    "data": Verb(
+        "data.commands",
+        "COMMANDS",
+        "look at a COCO-format folder, make one of other formats, fetch a TUM sequence",
+    ),
+    "synth": Verb(
+        "synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"
+    ),
     "fit": Verb("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),
-    "validate": Verb("validation", "validate", "score a checkpoint or an ONNX on a COCO-format folder"),
-    "export": Verb("exporter.export", "export", "checkpoint -> ONNX, run and compared before it is kept"),
-    "predict": Verb("prediction.predict", "predict", "run an ONNX on images: overlays and COCO JSON (no torch)"),
-    "bench": Verb("bench", "bench", "Table 4: networks trained, exported, scored and timed side by side"),
-    "slam": Verb("slam.run", "slam", "RGB-D sequence -> trajectory, map tracking with people removed (no torch)"),
-    "evaluate": Verb("trajectory.evaluate", "evaluate", "ATE and RPE of a trajectory against ground truth"),
-    "report": Verb("report", "report", "one HTML page of a SLAM run: scores, trajectory, times, pictures"),
+    "validate": Verb(
+        "validation", "validate", "score a checkpoint or an ONNX on a COCO-format folder"
+    ),
+    "export": Verb(
+        "exporter.export", "export", "checkpoint -> ONNX, run and compared before it is kept"
+    ),
+    "predict": Verb(
+        "prediction.predict", "predict", "run an ONNX on images: overlays and COCO JSON (no torch)"
+    ),
+    "bench": Verb(
+        "bench", "bench", "Table 4: networks trained, exported, scored and timed side by side"
+    ),
+    "slam": Verb(
+        "slam.run",
+        "slam",
+        "RGB-D sequence -> trajectory, map tracking with people removed (no torch)",
+    ),
+    "evaluate": Verb(
+        "trajectory.evaluate", "evaluate", "ATE and RPE of a trajectory against ground truth"
+    ),
+    "report": Verb(
+        "report", "report", "one HTML page of a SLAM run: scores, trajectory, times, pictures"
+    ),
     "env": Verb("env", "env", "versions of everything that matters, and what is wrong with them"),
 }
 
@@ -48,7 +74,9 @@ def help_text() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; returns the exit code: 0 done, 1 a user's error in one line, 2 usage. A bug keeps its traceback."""
+    """Run one verb; returns the exit code: 0 done, 1 a user's error in one line, 2 usage. A bug
+    keeps its traceback.
+    """
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
         print(help_text())
@@ -81,12 +109,16 @@ def _call(name: str, args: list[str]) -> None:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
             raise
-        message = f"{name} needs {package}, which is not installed: pip install 'cohdc-train[train]'"
+        message = (
+            f"{name} needs {package}, which is not installed: pip install 'cohdc-train[train]'"
+        )
         raise MissingExtraError(message) from error
 
 
 def _spelled_out(args: Sequence[str], switches: Container[str]) -> list[str]:
-    """Arguments with option names in underscores, and a switch's value behind it unless a truth value follows."""
+    """Arguments with option names in underscores, and a switch's value behind it unless a truth
+    value follows.
+    """
     spelled: list[str] = []
     for i, arg in enumerate(args):
         name, equals, value = arg.partition("=")
@@ -101,7 +133,9 @@ def _spelled_out(args: Sequence[str], switches: Container[str]) -> list[str]:
 
 
 def _run_function(component: Any, args: list[str], prog: str) -> None:
-    """Run a typed function, or the group of them in a dict, with a command line read from its signature."""
+    """Run a typed function, or the group of them in a dict, with a command line read from its
+    signature.
+    """
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
     switches: set[str] = set()
@@ -109,7 +143,8 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
     class Parser(ArgumentParser):
         """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`.
 
-        One inside a group does: `--method.loops false`; jsonargparse copies this method for groups, without its scope.
+        One inside a group does: `--method.loops false`; jsonargparse copies this method for groups,
+        without its scope.
         """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:

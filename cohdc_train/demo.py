@@ -56,15 +56,18 @@ class Clock:
 
 
 def demo(out: Path = Path("runs/demo"), quick: bool = False, seed: int = 0) -> dict[str, Any]:
-    """Render a set and a sequence, train, export, run SLAM without and with the segmenter, score and report.
+    """Render a set and a sequence, train, export, run SLAM without and with the segmenter, score
+    and report.
 
-    Writes into the output folder: data/, sequence/, train/, model.onnx, without/, with/, predictions/, report.html and
-    summary.json (segm_ap50, ate_without_m, ate_with_m, coverage, seconds). Everything is rendered; nothing is fetched.
+    Writes into the output folder: data/, sequence/, train/, model.onnx, without/, with/,
+    predictions/, report.html and summary.json (segm_ap50, ate_without_m, ate_with_m, coverage,
+    seconds). Everything is rendered; nothing is fetched.
 
     Args:
         out: new or empty folder, or that of a former demo, whose files are replaced.
         quick: a fraction of the images, frames and epochs; scores are worse.
-        seed: of rendering, training and SLAM; the same seed gives the same numbers on the same machine.
+        seed: of rendering, training and SLAM; the same seed gives the same numbers on the same
+            machine.
 
     Returns:
         The content of summary.json.
@@ -106,7 +109,10 @@ def table(summary: dict[str, Any], out: Path) -> str:
         ("mask AP50 on unseen rooms", f"{summary['segm_ap50']:.3f}"),
         ("ATE RMSE without masks", f"{summary['ate_without_m']:.4f} m"),
         ("ATE RMSE with masks", f"{summary['ate_with_m']:.4f} m"),
-        ("frames tracked, without / with", f"{summary['coverage_without']:.1%} / {summary['coverage']:.1%}"),
+        (
+            "frames tracked, without / with",
+            f"{summary['coverage_without']:.1%} / {summary['coverage']:.1%}",
+        ),
         *((f"time: {name}", f"{seconds:.0f} s") for name, seconds in summary["steps"].items()),
         ("time in all", f"{summary['seconds']:.0f} s"),
         ("report", str(out / "report.html")),
@@ -137,9 +143,13 @@ def _render(out: Path, plan: Plan, seed: int) -> None:
     """The set and the sequence, each in a process of its own on one core."""
     from cohdc_train.synth import coco, sequence
 
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), initializer=_use_one_thread) as pool:
+    with ProcessPoolExecutor(
+        2, multiprocessing.get_context("spawn"), initializer=_use_one_thread
+    ) as pool:
         jobs = [
-            pool.submit(coco, out / "data", train=plan.train_images, val=plan.val_images, seed=seed),
+            pool.submit(
+                coco, out / "data", train=plan.train_images, val=plan.val_images, seed=seed
+            ),
             pool.submit(sequence, out / "sequence", frames=plan.frames, seed=seed),
         ]
         for job in jobs:
@@ -147,7 +157,9 @@ def _render(out: Path, plan: Plan, seed: int) -> None:
 
 
 def _use_one_thread() -> None:
-    """For a new process, before numpy is loaded in it: threads of two renderers would wait for each other."""
+    """For a new process, before numpy is loaded in it: threads of two renderers would wait for each
+    other.
+    """
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     import cv2
 
@@ -157,8 +169,8 @@ def _use_one_thread() -> None:
 def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
     """Train the network of configs/demo.yaml; returns the validation scores of the best checkpoint.
 
-    By the command line, which Lightning starts once more for the second process of the two that configs/demo.yaml asks
-    for.
+    By the command line, which Lightning starts once more for the second process of the two that
+    configs/demo.yaml asks for.
     """
     from cohdc_train.validation import validate
 
@@ -170,7 +182,13 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
         "--trainer.check_val_every_n_epoch": plan.epochs,
         "--seed_everything": seed,
     }
-    fit = [sys.executable, "-m", "cohdc_train", "fit", *(str(part) for option in options.items() for part in option)]
+    fit = [
+        sys.executable,
+        "-m",
+        "cohdc_train",
+        "fit",
+        *(str(part) for option in options.items() for part in option),
+    ]
     if subprocess.run(fit, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode != 0:
         raise CohdcError("the training ended early; its own message stands above")
     return validate(out / "train" / "best.ckpt", out / "data", out / "train" / "scores.json")
@@ -186,8 +204,11 @@ def _slam(sequence: Path, out: Path, model: Path | None, seed: int) -> dict[str,
     from cohdc_train.slam.config import Culling
     from cohdc_train.slam.run import slam
 
-    # A network trained for minutes misses limbs and doubts people at the border: trust less, cut wider.
-    return slam(sequence=sequence, out=out, model=model, seed=seed, culling=Culling(score=0.2, dilate=20))
+    # A network trained for minutes misses limbs and doubts people at the border: trust less, cut
+    # wider.
+    return slam(
+        sequence=sequence, out=out, model=model, seed=seed, culling=Culling(score=0.2, dilate=20)
+    )
 
 
 def _report(out: Path, scores: dict[str, float], clock: Clock) -> None:
@@ -201,7 +222,11 @@ def _report(out: Path, scores: dict[str, float], clock: Clock) -> None:
         shutil.copy(frame, chosen / frame.name)
     predict(chosen, model=out / "model.onnx", out=out / "predictions")
     tables = [
-        Table("Segmentation on unseen rooms", ["score", "value"], [[n, f"{v:.4f}"] for n, v in scores.items()]),
+        Table(
+            "Segmentation on unseen rooms",
+            ["score", "value"],
+            [[n, f"{v:.4f}"] for n, v in scores.items()],
+        ),
         Table("Time per step", ["step", "s"], [[n, f"{s:.1f}"] for n, s in clock.seconds.items()]),
     ]
     write_report(

@@ -2,7 +2,9 @@
 
 
 class CohdcError(Exception):
-    """A user's error, told in one line that names the file and the number; `cohdc` prints it and exits 1."""
+    """A user's error, told in one line that names the file and the number; `cohdc` prints it and
+    exits 1.
+    """
 
 
 class DataError(CohdcError):
@@ -18,4 +20,6 @@ class ExportError(CohdcError):
 
 
 class MissingExtraError(CohdcError):
-    """A verb needs packages of an extra that is not installed; the message holds the command that installs it."""
+    """A verb needs packages of an extra that is not installed; the message holds the command that
+    installs it.
+    """

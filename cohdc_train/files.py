@@ -17,7 +17,9 @@ _SHOWN = 5  # names in a refusal
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write to a name beside `path`, then rename: a reader sees the old file or the new one, never a part."""
+    """Write to a name beside `path`, then rename: a reader sees the old file or the new one, never
+    a part.
+    """
     temporary = path.with_name(path.name + ".part")
     try:
         temporary.write_bytes(content)
@@ -55,7 +57,8 @@ def sha256(path: Path) -> str:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `out` when the block ends well and vanishes when it does not.
+    """A folder to write into, which becomes `out` when the block ends well and vanishes when it
+    does not.
 
     Raises DataError when `out` is a file or a folder with something in it.
     """

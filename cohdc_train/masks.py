@@ -1,4 +1,6 @@
-"""RoI masks -> masks of the whole image: the one paste that training's scores, `predict` and SLAM share."""
+"""RoI masks -> masks of the whole image: the one paste that training's scores, `predict` and SLAM
+share.
+"""
 
 import cv2
 import numpy as np
@@ -6,7 +8,10 @@ from numpy.typing import NDArray
 
 
 def paste_roi_mask(
-    roi_mask: NDArray[np.float32], box: NDArray[np.float32], size: tuple[int, int], threshold: float = 0.5
+    roi_mask: NDArray[np.float32],
+    box: NDArray[np.float32],
+    size: tuple[int, int],
+    threshold: float = 0.5,
 ) -> NDArray[np.bool_]:
     """One RoI mask laid over its box in the image: [height, width] bool. See `roi_window`."""
     mask = np.zeros(size, dtype=np.bool_)
@@ -16,13 +21,17 @@ def paste_roi_mask(
 
 
 def roi_window(
-    roi_mask: NDArray[np.float32], box: NDArray[np.float32], size: tuple[int, int], threshold: float = 0.5
+    roi_mask: NDArray[np.float32],
+    box: NDArray[np.float32],
+    size: tuple[int, int],
+    threshold: float = 0.5,
 ) -> tuple[NDArray[np.bool_], tuple[int, int]]:
-    """The part of the image's mask that lies in the box: [h, w] bool, and (row, column) of its first pixel.
+    """The part of the image's mask that lies in the box: [h, w] bool, and (row, column) of its
+    first pixel.
 
     roi_mask: [M, M] probability; box: [4] xyxy, px; size: (height, width) of the image, px.
-    A pixel's centre is mapped into the RoI grid and sampled bilinearly; pixels whose centre lies outside the box are
-    no part of the mask.
+    A pixel's centre is mapped into the RoI grid and sampled bilinearly; pixels whose centre lies
+    outside the box are no part of the mask.
     """
     height, width = size
     x0, y0, x1, y1 = (float(v) for v in box)

@@ -1,4 +1,6 @@
-"""Where the shipped files lie: YAML in `configs/` of a checkout or its copy inside a wheel, networks in `shipped/`."""
+"""Where the shipped files lie: YAML in `configs/` of a checkout or its copy inside a wheel,
+networks in `shipped/`.
+"""
 
 from pathlib import Path
 
@@ -8,7 +10,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def config_path(name: str | Path) -> Path:
-    """The YAML file a user means by `name`: a path that exists, else a shipped one such as `table3/test10.yaml`.
+    """The YAML file a user means by `name`: a path that exists, else a shipped one such as
+    `table3/test10.yaml`.
 
     A leading `configs/` is optional. Raises CohdcError naming the file when there is neither.
     """
@@ -29,7 +32,9 @@ def model_path(name: str | Path) -> Path:
     """
     given = Path(name)
     shipped = _PACKAGE / "shipped" / f"{given}.onnx"
-    return shipped if not given.is_file() and given.name == str(given) and shipped.is_file() else given
+    return (
+        shipped if not given.is_file() and given.name == str(given) and shipped.is_file() else given
+    )
 
 
 def shipped_models() -> list[str]:

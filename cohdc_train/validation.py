@@ -37,15 +37,19 @@ def validate(
     """Print a model's scores on the validation split of a COCO-format folder.
 
     Args:
-        model: best.ckpt or last.ckpt of a training, an ONNX file, or a shipped network's name: person, person_s.
-        root: the COCO-format folder; its other classes are left out. Of an ONNX file, those that both have are scored.
+        model: best.ckpt or last.ckpt of a training, an ONNX file, or a shipped network's name:
+            person, person_s.
+        root: the COCO-format folder; its other classes are left out. Of an ONNX file, those that
+            both have are scored.
         out: JSON file for the scores.
-        rescore: rank masks by score * quality; the training's choice when not given, yes for an ONNX file.
+        rescore: rank masks by score * quality; the training's choice when not given, yes for an
+            ONNX file.
         min_quality: leave out detections of a lower quality, as the paper does below 0.9.
         batch_size: images per batch; an ONNX file takes one at a time.
         workers: processes that read images for a checkpoint.
         precision: Lightning's precision for a checkpoint, such as bf16-mixed.
-        canvas: height and width in px to fit images into; the training's when not given. An ONNX file has its own.
+        canvas: height and width in px to fit images into; the training's when not given. An ONNX
+            file has its own.
         pictures: folder for best.jpg, worst.jpg, pr_curves.png, calibration.png and confusion.png.
         threads: onnxruntime's threads; 0 leaves it to onnxruntime.
 
@@ -79,10 +83,14 @@ def validate(
 def validation_data(
     root: Path, model: Path, class_names: list[str], batch_size: int = 2, workers: int = 0
 ) -> CocoDataModule:
-    """A folder's data with the classes of a model. Raises CohdcError when they stand in another order there."""
+    """A folder's data with the classes of a model. Raises CohdcError when they stand in another
+    order there.
+    """
     data = CocoDataModule(root, class_names, batch_size=batch_size, workers=workers)
     if data.class_names != class_names:
-        raise CohdcError(f"{root}: class order {data.class_names} is not that of {model}: {class_names}")
+        raise CohdcError(
+            f"{root}: class order {data.class_names} is not that of {model}: {class_names}"
+        )
     return data
 
 
@@ -91,7 +99,9 @@ def _common_classes(root: Path, model: Path, names: Sequence[str]) -> list[str]:
     known = CocoDataModule(root).class_names
     common = [name for name in known if name in names]
     if not common:
-        raise CohdcError(f"{model}: none of its {len(names)} classes is one of {root}: {', '.join(known)}")
+        raise CohdcError(
+            f"{model}: none of its {len(names)} classes is one of {root}: {', '.join(known)}"
+        )
     return common
 
 
@@ -102,19 +112,29 @@ def score_module(
     min_quality: float = 0.0,
     precision: str = "32-true",
 ) -> Results:
-    """What a network finds on the validation split, and its scores. rescore: None is the training's choice."""
+    """What a network finds on the validation split, and its scores. rescore: None is the training's
+    choice.
+    """
     module.rescore = module.rescore if rescore is None else rescore
     module.min_quality = min_quality
     with told_in_one_line():
-        trainer = Trainer(logger=False, enable_checkpointing=False, precision=precision, enable_model_summary=False)  # type: ignore[arg-type]
+        trainer = Trainer(
+            logger=False,
+            enable_checkpointing=False,
+            precision=precision,
+            enable_model_summary=False,
+        )  # type: ignore[arg-type]
         trainer.validate(module, datamodule=data, verbose=False)
     if module.results is None:
         raise RuntimeError("validation left no results")
     return module.results
 
 
-def score_file(model: Path, root: Path, rescore: bool = True, min_quality: float = 0.0, threads: int = 0) -> Results:
-    """What an ONNX file finds of the classes that it and a folder's validation split have in common, and its scores.
+def score_file(
+    model: Path, root: Path, rescore: bool = True, min_quality: float = 0.0, threads: int = 0
+) -> Results:
+    """What an ONNX file finds of the classes that it and a folder's validation split have in
+    common, and its scores.
 
     Raises CohdcError when there is no such class, ContractError and DataError for file and folder.
     """
@@ -124,14 +144,23 @@ def score_file(model: Path, root: Path, rescore: bool = True, min_quality: float
     return score_segmenter(segmenter, data.folder.val, rescore, min_quality)
 
 
-def score_segmenter(segmenter: Segmenter, split: CocoSplit, rescore: bool = True, min_quality: float = 0.0) -> Results:
-    """What an ONNX file finds of a split's classes, and its scores. Every class of the split is one of the file's."""
+def score_segmenter(
+    segmenter: Segmenter, split: CocoSplit, rescore: bool = True, min_quality: float = 0.0
+) -> Results:
+    """What an ONNX file finds of a split's classes, and its scores. Every class of the split is one
+    of the file's.
+    """
     metrics = SegmentationMetrics(split.ground_truth(), rescore, min_quality)
-    labels = {segmenter.class_names.index(name): label for label, name in enumerate(split.class_names)}
+    labels = {
+        segmenter.class_names.index(name): label for label, name in enumerate(split.class_names)
+    }
     for image in split.images:
         found = segmenter(read_image(image))
         found = found.select(np.isin(found.labels, list(labels)))
         fields = {name: getattr(found, name) for name in ("boxes", "scores", "quality")}
-        fields |= {"labels": np.array([labels[label] for label in found.labels], np.int64), "masks": found.roi_masks}
+        fields |= {
+            "labels": np.array([labels[label] for label in found.labels], np.int64),
+            "masks": found.roi_masks,
+        }
         metrics.update(image.id, {name: torch.from_numpy(value) for name, value in fields.items()})
     return metrics.results()

@@ -25,7 +25,9 @@ SMALL = NetworkConfig(
 
 @pytest.fixture(scope="session")
 def opinionated():
-    """Random weights, scaled until boxes and masks differ from place to place, and no score is saturated."""
+    """Random weights, scaled until boxes and masks differ from place to place, and no score is
+    saturated.
+    """
     torch.manual_seed(0)
     network = MaskRCNN(2, SMALL).eval()
     with torch.no_grad():

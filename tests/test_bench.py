@@ -19,7 +19,16 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.segmenter import Detections
 
 KEYS = {
-    *("name", "train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "model_mb", "ap", "boundary_ap"),
+    *(
+        "name",
+        "train_seconds",
+        "fps_torch",
+        "fps_ort",
+        "fps_ort_int8",
+        "model_mb",
+        "ap",
+        "boundary_ap",
+    ),
     *("s90_matched", "s90_all", "peak_mb"),
 }
 TINY = """
@@ -54,7 +63,9 @@ def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monke
 
         return run
 
-    monkeypatch.setattr("cohdc_train.exporter.interleaved_timing.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr(
+        "cohdc_train.exporter.interleaved_timing.time.perf_counter", lambda: clock[0]
+    )
     pictures = [np.full((8, 8, 3), i, np.uint8) for i in range(3)]
     rates = frame_rates({"slow": runner("slow", 0.5), "fast": runner("fast", 0.125)}, pictures)
     assert order == [(name, i) for i in (0, 0, 1, 2) for name in ("slow", "fast")]
@@ -63,24 +74,46 @@ def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monke
 
 
 def entry(tmp_path: Path, seed: int | None, ap: float) -> Entry:
-    files = {"fps_ort": tmp_path / "a.onnx"} | ({} if seed is None else {"fps_ort_int8": tmp_path / "b.onnx"})
+    files = {"fps_ort": tmp_path / "a.onnx"} | (
+        {} if seed is None else {"fps_ort_int8": tmp_path / "b.onnx"}
+    )
     for path in files.values():
         path.write_bytes(b"0" * 2_500_000)
-    scores = {"ap": ap, "boundary_ap": 0.1, "s90_matched": float("nan"), "s90_all": 0.0, "vertices": 20.0}
+    scores = {
+        "ap": ap,
+        "boundary_ap": 0.1,
+        "s90_matched": float("nan"),
+        "s90_all": 0.0,
+        "vertices": 20.0,
+    }
     seconds = None if seed is None else 60.0 + 10 * seed
-    return Entry("row", seed, None, files, seconds, scores if seed is None else scores | {"ap_int8": ap - 0.01})
+    return Entry(
+        "row",
+        seed,
+        None,
+        files,
+        seconds,
+        scores if seed is None else scores | {"ap_int8": ap - 0.01},
+    )
 
 
 def test_a_row_holds_medians_over_seeds_ranges_and_null_where_there_is_nothing(tmp_path):
     rates = {"fps_ort": (4.0, 3.0, 5.0), "fps_ort_int8": (8.0, 7.0, 9.0)}
-    row = _row("ours", [entry(tmp_path, s, ap) for s, ap in enumerate((0.3, 0.5, 0.4))], _rates(rates), 99.0)
+    row = _row(
+        "ours",
+        [entry(tmp_path, s, ap) for s, ap in enumerate((0.3, 0.5, 0.4))],
+        _rates(rates),
+        99.0,
+    )
     assert set(row) >= KEYS
     assert (row["ap"], row["ap_int8"], row["train_seconds"]) == pytest.approx((0.4, 0.39, 70.0))
     assert row["ranges"]["ap"] == [0.3, 0.5]
     assert row["s90_matched"] is None
     assert row["fps_torch"] is None
     assert row["model_mb"] == 2.5
-    foreign = _row("peer.onnx", [entry(tmp_path, None, 0.2)], _rates({"fps_ort": (4.0, 3.0, 5.0)}), 99.0)
+    foreign = _row(
+        "peer.onnx", [entry(tmp_path, None, 0.2)], _rates({"fps_ort": (4.0, 3.0, 5.0)}), 99.0
+    )
     assert foreign["train_seconds"] is foreign["fps_ort_int8"] is foreign["ap_int8"] is None
     text = as_text([row, foreign], "a machine")
     assert "0.400 (0.300-0.500)" in text
@@ -101,8 +134,15 @@ def test_spread_is_median_and_range():
 
 
 def test_the_budget_is_epochs_or_minutes():
-    assert _fit_options(Path("c.yaml"), ["--x=1"], 3, None) == ("--config=c.yaml", "--x=1", "--trainer.max_epochs=3")
-    assert _fit_options(None, [], None, 90.5) == ("--trainer.max_time=00:01:30:30", "--trainer.max_epochs=-1")
+    assert _fit_options(Path("c.yaml"), ["--x=1"], 3, None) == (
+        "--config=c.yaml",
+        "--x=1",
+        "--trainer.max_epochs=3",
+    )
+    assert _fit_options(None, [], None, 90.5) == (
+        "--trainer.max_time=00:01:30:30",
+        "--trainer.max_epochs=-1",
+    )
     for epochs, minutes in ((None, None), (3, 2.0)):
         with pytest.raises(CohdcError, match="a budget is needed"):
             _fit_options(None, [], epochs, minutes)
@@ -121,12 +161,27 @@ def test_bench_keeps_a_table_it_did_not_write(tmp_path):
 
 
 def test_unknown_rows_and_files_are_one_line(tmp_path):
-    with pytest.raises(CohdcError, match="no row 'VGG'; there are HDC-Net, ResNet50, ResNet101, MobileNetV1"):
+    with pytest.raises(
+        CohdcError, match="no row 'VGG'; there are HDC-Net, ResNet50, ResNet101, MobileNetV1"
+    ):
         bench(tmp_path, out=tmp_path / "o", rows=["VGG"], epochs=1)
     with pytest.raises(CohdcError, match="two have the same name"):
-        bench(tmp_path, out=tmp_path / "o", rows=["ResNet50", _renamed(tmp_path, "ResNet50.yaml")], epochs=1)
-    with pytest.raises(CohdcError, match="weights are given for 'MobileNetV1', which is none of the rows"):
-        bench(tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"MobileNetV1": "x.pth"}, epochs=1)
+        bench(
+            tmp_path,
+            out=tmp_path / "o",
+            rows=["ResNet50", _renamed(tmp_path, "ResNet50.yaml")],
+            epochs=1,
+        )
+    with pytest.raises(
+        CohdcError, match="weights are given for 'MobileNetV1', which is none of the rows"
+    ):
+        bench(
+            tmp_path,
+            out=tmp_path / "o",
+            rows=["ResNet50"],
+            weights={"MobileNetV1": "x.pth"},
+            epochs=1,
+        )
     with pytest.raises(CohdcError, match="no row 'VGG'"):
         bench(tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"VGG": "x.pth"}, epochs=1)
     with pytest.raises(CohdcError, match=r"absent\.onnx: no such file"):
@@ -188,10 +243,15 @@ def network_of(row):
 
 
 def test_rows_differ_as_their_names_say():
-    """Table 4's networks by tensors and rates: HDC-Net is dilated and has to be a tenth smaller than ResNet50."""
+    """Table 4's networks by tensors and rates: HDC-Net is dilated and has to be a tenth smaller
+    than ResNet50.
+    """
     networks = {row: network_of(row) for row in (*ROWS, "networks/resnet50_hdc.yaml")}
     body, whole = (
-        {row: sum(p.numel() for p in part(network).parameters()) for row, network in networks.items()}
+        {
+            row: sum(p.numel() for p in part(network).parameters())
+            for row, network in networks.items()
+        }
         for part in (lambda network: network.backbone.body, lambda network: network)
     )
     for row, network in networks.items():
@@ -243,7 +303,13 @@ def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
     assert [row["name"] for row in written] == ["resnet50", "MobileNetV1"]
     for row in written:
         assert set(row) >= KEYS
-        assert min(row[key] for key in ("train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "peak_mb")) > 0
+        assert (
+            min(
+                row[key]
+                for key in ("train_seconds", "fps_torch", "fps_ort", "fps_ort_int8", "peak_mb")
+            )
+            > 0
+        )
         assert row["model_mb_int8"] < row["model_mb"]
         assert 0 <= row["ap"] <= 1
         assert row["peak_mb"] < 400  # of a process without torch, not of this one

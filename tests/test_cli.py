@@ -12,7 +12,14 @@ from cohdc_train import cli
 from cohdc_train.cli import VERBS, main
 from cohdc_train.errors import DataError
 
-TRAIN_VERBS = {"fit", "validate", "export", "data", "synth", "demo"}  # may need the train extra, even for their help
+TRAIN_VERBS = {
+    "fit",
+    "validate",
+    "export",
+    "data",
+    "synth",
+    "demo",
+}  # may need the train extra, even for their help
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -31,9 +38,7 @@ def test_help_costs_little_and_imports_little() -> None:
 
 
 def test_help_imports_no_parser_and_no_numpy() -> None:
-    code = (
-        "import sys, json; from cohdc_train.cli import main; main(['--help']); print(json.dumps(sorted(sys.modules)))"
-    )
+    code = "import sys, json; from cohdc_train.cli import main; main(['--help']); print(json.dumps(sorted(sys.modules)))"
     modules = set(json.loads(run("-c", code).stdout.splitlines()[-1]))
     assert modules.isdisjoint({"jsonargparse", "numpy", "cv2", "torch", "onnxruntime", "yaml"})
 
@@ -70,7 +75,11 @@ def test_unknown_option_ends_with_two(capsys: pytest.CaptureFixture[str]) -> Non
 
 # these two load Lightning for their help, which takes seconds
 @pytest.mark.parametrize(
-    "verb", [pytest.param(verb, marks=pytest.mark.slow) if verb in ("fit", "validate") else verb for verb in VERBS]
+    "verb",
+    [
+        pytest.param(verb, marks=pytest.mark.slow) if verb in ("fit", "validate") else verb
+        for verb in VERBS
+    ],
 )
 def test_every_verb_has_help_and_the_robots_verbs_import_no_torch(verb: str) -> None:
     code = (
@@ -89,13 +98,18 @@ def test_every_verb_has_help_and_the_robots_verbs_import_no_torch(verb: str) -> 
         assert heavy == []
 
 
-def test_users_error_is_one_line_and_ends_with_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_users_error_is_one_line_and_ends_with_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bad = tmp_path / "bad.txt"
     bad.write_text("1 2 3\n")
     assert main(["evaluate", str(bad), str(bad)]) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err == f"cohdc evaluate: {bad}:1: 3 numbers where stamp tx ty tz qx qy qz qw are 8\n"
+    assert (
+        captured.err
+        == f"cohdc evaluate: {bad}:1: 3 numbers where stamp tx ty tz qx qy qz qw are 8\n"
+    )
 
 
 @pytest.mark.parametrize("error", [DataError("file.txt:3: no"), RuntimeError("a bug")])

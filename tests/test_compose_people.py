@@ -1,4 +1,6 @@
-"""tools/compose_people: a cut-out stands where geometry says, moves with the world, and hides behind what is nearer."""
+"""tools/compose_people: a cut-out stands where geometry says, moves with the world, and hides
+behind what is nearer.
+"""
 
 from pathlib import Path
 from types import ModuleType
@@ -49,14 +51,18 @@ def test_a_person_walks_in_the_world_not_with_the_camera(tool: ModuleType) -> No
     directions = tool.rays(CAMERA, 1)
 
     def middle(t: float, pose: np.ndarray) -> float:
-        return float(np.nonzero(np.isfinite(tool.seen(person, way, t, pose, directions)[1]))[1].mean())
+        return float(
+            np.nonzero(np.isfinite(tool.seen(person, way, t, pose, directions)[1]))[1].mean()
+        )
 
     assert middle(0.0, LEVEL) == pytest.approx(79.5, abs=1)
     assert middle(1.0, LEVEL) == pytest.approx(79.5 + 0.5 / 2 * 200, abs=1)
     assert middle(1.0, moved) == pytest.approx(79.5, abs=1)
 
 
-def test_what_is_nearer_hides_a_person_and_the_rest_stays_as_it_was(tool: ModuleType, tmp_path: Path) -> None:
+def test_what_is_nearer_hides_a_person_and_the_rest_stays_as_it_was(
+    tool: ModuleType, tmp_path: Path
+) -> None:
     depth = np.full((120, 160), 15000, np.uint16)  # a wall 3 m away
     depth[60:] = 5000  # and a table 1 m away
     depth[:, :20] = 0

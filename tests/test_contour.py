@@ -7,7 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cohdc_train.contour import METHODS, BeetleSearch, Method, Polygon, joined, rasterize, simplify, trace, vertices
+from cohdc_train.contour import (
+    METHODS,
+    BeetleSearch,
+    Method,
+    Polygon,
+    joined,
+    rasterize,
+    simplify,
+    trace,
+    vertices,
+)
 from cohdc_train.contour.polygon_iou import Coverage, crossing
 
 SIZE = (96, 128)
@@ -67,9 +77,13 @@ def test_keyhole_rings_fill_like_polygons_with_holes(seed: int) -> None:
     assert np.array_equal(rasterize(joined, SIZE), rasterize(polygons, SIZE))
 
 
-@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools under numpy 2
+@pytest.mark.filterwarnings(
+    "ignore:__array__ implementation:DeprecationWarning"
+)  # pycocotools under numpy 2
 def test_coco_tools_fill_our_rings_alike() -> None:
-    mask_tools = pytest.importorskip("pycocotools.mask", reason="pycocotools comes with the train extra")
+    mask_tools = pytest.importorskip(
+        "pycocotools.mask", reason="pycocotools comes with the train extra"
+    )
     mask = blob(3)
     rings = [polygon.keyhole().ravel().tolist() for polygon in trace(mask)]
     theirs = mask_tools.decode(mask_tools.merge(mask_tools.frPyObjects(rings, *SIZE)))
@@ -127,19 +141,28 @@ def test_beetles_need_fewer_vertices_than_bisection() -> None:
 
 def test_same_seed_same_polygon() -> None:
     polygons = trace(blob(4))
-    first, again = (simplify(polygons, 0.9, "bas_dp", search=BeetleSearch(seed=5)) for _ in range(2))
+    first, again = (
+        simplify(polygons, 0.9, "bas_dp", search=BeetleSearch(seed=5)) for _ in range(2)
+    )
     assert all(np.array_equal(a.outer, b.outer) for a, b in zip(first, again, strict=True))
 
 
 def test_fixed_tolerance_knows_no_floor() -> None:
     polygons = trace(blob(5))
-    coarse, fine = simplify(polygons, 1.0, "dp", epsilon=6), simplify(polygons, 1.0, "dp", epsilon=1)
+    coarse, fine = (
+        simplify(polygons, 1.0, "dp", epsilon=6),
+        simplify(polygons, 1.0, "dp", epsilon=1),
+    )
     assert vertices(coarse) < vertices(fine) < vertices(polygons)
 
 
 def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
     """Every edge against every other, in plain Python: whether two cross in a point inside both."""
-    edges = [(a, b) for ring in rings for a, b in zip(ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True)]
+    edges = [
+        (a, b)
+        for ring in rings
+        for a, b in zip(ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True)
+    ]
 
     def side(a: list[float], b: list[float], c: list[float]) -> float:
         return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
@@ -153,13 +176,19 @@ def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
 
 @given(SEEDS, FLOORS, st.sampled_from(WITH_FLOOR))
 @settings(max_examples=30, deadline=None)
-def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(seed: int, floor: float, method: Method) -> None:
+def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(
+    seed: int, floor: float, method: Method
+) -> None:
     """Holes turn against their outer ring."""
     simpler = simplify(trace(blob(seed)), floor, method, search=BeetleSearch(n=3))
     assert not cross_somewhere([ring for polygon in simpler for ring in polygon.rings])
 
     def turn(ring: NDArray[np.float64]) -> float:
-        return float(np.sign(np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - ring[:, 1] * np.roll(ring[:, 0], -1))))
+        return float(
+            np.sign(
+                np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - ring[:, 1] * np.roll(ring[:, 0], -1))
+            )
+        )
 
     assert len({turn(polygon.outer) for polygon in simpler}) <= 1
     assert all(turn(hole) == -turn(polygon.outer) for polygon in simpler for hole in polygon.holes)
@@ -248,7 +277,9 @@ def test_odd_masks_have_outlines_that_keep_the_floor(name: str, method: Method) 
 
 
 def test_a_huge_mask_is_traced_and_simplified() -> None:
-    """8000 x 8000 px; with a full frame's area it would take minutes if a step were quadratic in pixels."""
+    """8000 x 8000 px; with a full frame's area it would take minutes if a step were quadratic in
+    pixels.
+    """
     mask = np.zeros((8000, 8000), bool)
     cv2.ellipse(view := mask.view(np.uint8), (4000, 4000), (3500, 2000), 30, 0, 360, 1, -1)
     simpler = simplify(trace(mask), 0.97, "bas_dp")
@@ -286,11 +317,15 @@ def test_the_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
 
 
 def test_an_unknown_method_is_named() -> None:
-    with pytest.raises(ValueError, match="contour method 'rdp'; there are bisection, bas_dp, dp, visvalingam"):
+    with pytest.raises(
+        ValueError, match="contour method 'rdp'; there are bisection, bas_dp, dp, visvalingam"
+    ):
         simplify(trace(blob(0)), method="rdp")  # type: ignore[arg-type]
 
 
 def test_search_parameters_have_the_papers_names() -> None:
     search = BeetleSearch(S=1.0, H=0.5, c=1.0, n=3)
     polygons = trace(blob(6))
-    assert vertices(simplify(polygons, 0.9, "bas_dp", search=search)) <= vertices(simplify(polygons, 0.9))
+    assert vertices(simplify(polygons, 0.9, "bas_dp", search=search)) <= vertices(
+        simplify(polygons, 0.9)
+    )

@@ -28,7 +28,9 @@ def two_discs(radius: float) -> NDArray[np.bool_]:
 def test_bracket_closes_on_the_tolerance_that_reaches_the_floor(
     right: float, power: float, wrong: float, allowed: float
 ) -> None:
-    """What is lost is a power of the tolerance; the first guess is off by `wrong`. Vertices never end the search."""
+    """What is lost is a power of the tolerance; the first guess is off by `wrong`. Vertices never
+    end the search.
+    """
     bracket = Bracket.of(0.25, 40.0, allowed, wrong * allowed / right)
     tried = 0
     while True:
@@ -41,7 +43,9 @@ def test_bracket_closes_on_the_tolerance_that_reaches_the_floor(
     assert tried <= 12
     assert exp(bracket.low.at) <= right
     gap = log(right) - bracket.low.at
-    assert power * gap <= 0.08 or gap <= 0.06, "neither is the floor all but reached nor the bracket narrow"
+    assert power * gap <= 0.08 or gap <= 0.06, (
+        "neither is the floor all but reached nor the bracket narrow"
+    )
 
 
 def test_bracket_ends_when_its_ends_differ_by_one_vertex() -> None:
@@ -52,7 +56,9 @@ def test_bracket_ends_when_its_ends_differ_by_one_vertex() -> None:
 
 @given(st.lists(st.integers(3, 9), min_size=1, max_size=4), st.integers(0, 20))
 @settings(max_examples=60, deadline=None)
-def test_beetles_of_a_turn_are_no_neighbours_and_every_beetle_gets_its_turn(sizes: list[int], first: int) -> None:
+def test_beetles_of_a_turn_are_no_neighbours_and_every_beetle_gets_its_turn(
+    sizes: list[int], first: int
+) -> None:
     rings = []
     for k, size in enumerate(sizes):
         angle = np.arange(size) * 2 * np.pi / size
@@ -69,8 +75,12 @@ def test_beetles_of_a_turn_are_no_neighbours_and_every_beetle_gets_its_turn(size
 
 @given(st.floats(4, 25), st.integers(0, 1000))
 @settings(max_examples=30, deadline=None)
-def test_what_f_adds_up_to_is_the_pixels_that_only_one_of_the_two_has(radius: float, seed: int) -> None:
-    """Through moves and drops, of one vertex, of several and of a whole part; counted by filling at the end."""
+def test_what_f_adds_up_to_is_the_pixels_that_only_one_of_the_two_has(
+    radius: float, seed: int
+) -> None:
+    """Through moves and drops, of one vertex, of several and of a whole part; counted by filling at
+    the end.
+    """
     mask, rng = two_discs(radius), np.random.default_rng(seed)
     outline = trace(mask)
     coverage = Coverage(outline)
@@ -98,7 +108,10 @@ def test_moves_after_the_last_drop_raise_the_iou() -> None:
     """Above what the floor asks for, with the vertices that are left."""
     mask = two_discs(25)
     polygons = trace(mask)
-    spare = [Coverage(polygons).iou(simplify(polygons, floor, "bas_dp")) - floor for floor in (0.93, 0.95, 0.97)]
+    spare = [
+        Coverage(polygons).iou(simplify(polygons, floor, "bas_dp")) - floor
+        for floor in (0.93, 0.95, 0.97)
+    ]
     assert min(spare) >= 0
     assert max(spare) > 0.005
 

@@ -12,7 +12,9 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.files import MANIFEST, files_below
 from cohdc_train.trajectory.trajectory import read_tum
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +22,9 @@ def finished(tmp_path_factory):
     """A demo of a few images and frames through the command line; its folder."""
     out = tmp_path_factory.mktemp("demo") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo_module, "QUICK", Plan(train_images=16, val_images=3, frames=12, epochs=1))
+        patch.setattr(
+            demo_module, "QUICK", Plan(train_images=16, val_images=3, frames=12, epochs=1)
+        )
         assert main(["demo", "--out", str(out), "--quick", "--seed", "3"]) == 0
     return out
 
@@ -31,7 +35,9 @@ def test_the_summary_holds_numbers_a_script_can_read(finished):
         assert math.isfinite(summary[name]), name
     assert 0 <= summary["segm_ap50"] <= 1
     assert summary["coverage_without"] == 1.0
-    assert 0 < summary["coverage"] <= 1  # a network of a few steps may take the whole room for people
+    assert (
+        0 < summary["coverage"] <= 1
+    )  # a network of a few steps may take the whole room for people
     assert summary["seconds"] == pytest.approx(sum(summary["steps"].values()), abs=0.06)
     assert summary["seed"] == 3
 

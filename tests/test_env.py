@@ -19,8 +19,13 @@ def test_it_knows_of_every_package_that_is_needed() -> None:
 
 
 def plant(folder: Path, monkeypatch: pytest.MonkeyPatch, **modules: str) -> None:
-    """Modules that come before the installed ones in the probes' processes; cv2 and onnxruntime are planted too."""
-    empty = {"cv2": "def setNumThreads(n): pass", "onnxruntime": "def get_available_providers(): return ['CPU']"}
+    """Modules that come before the installed ones in the probes' processes; cv2 and onnxruntime are
+    planted too.
+    """
+    empty = {
+        "cv2": "def setNumThreads(n): pass",
+        "onnxruntime": "def get_available_providers(): return ['CPU']",
+    }
     for name, code in {**empty, **modules}.items():
         (folder / f"{name}.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", str(folder))
@@ -31,8 +36,12 @@ def test_healthy_base_install_has_no_fault(tmp_path: Path, monkeypatch: pytest.M
     assert inspect(HEALTHY) == (["onnxruntime providers: CPU"], [])
 
 
-def test_mismatched_pair_is_found_and_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch = "class cuda:\n device_count = is_available = staticmethod(int)\nclass version: cuda = None"
+def test_mismatched_pair_is_found_and_mended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch = (
+        "class cuda:\n device_count = is_available = staticmethod(int)\nclass version: cuda = None"
+    )
     plant(
         tmp_path,
         monkeypatch,
@@ -47,7 +56,9 @@ def test_mismatched_pair_is_found_and_mended(tmp_path: Path, monkeypatch: pytest
     assert fault.mend.startswith("pip install --force-reinstall torch torchvision")
 
 
-def test_broken_torch_is_not_blamed_on_the_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_torch_is_not_blamed_on_the_pair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plant(tmp_path, monkeypatch, torch="raise OSError('libc10.so: cannot open')")
     (fault,) = inspect({**HEALTHY, "torch": "2.14.0", "torchvision": "0.29.0"})[1]
     assert fault.what == "torch does not load: OSError: libc10.so: cannot open"
@@ -65,7 +76,9 @@ def test_two_opencvs_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("version", ["2.6.2", "2.6.3"])
-def test_malicious_lightning_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str) -> None:
+def test_malicious_lightning_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str
+) -> None:
     plant(tmp_path, monkeypatch)
     (fault,) = inspect({**HEALTHY, "lightning": version})[1]
     assert fault.what == f"lightning {version} was a malicious release"
@@ -88,7 +101,9 @@ def test_verb_tells_an_absent_extra_and_ends_well(
     assert "a line\nno fault found" in printed
 
 
-def test_verb_fails_in_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verb_fails_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     faults = [Fault("first is broken", "mend it"), Fault("second is broken", "mend that")]
     monkeypatch.setattr(environment, "inspect", lambda versions: ([], faults))
     with pytest.raises(CohdcError, match=r"^first is broken; mend: mend it \(and 1 more\)$"):

@@ -25,7 +25,9 @@ from cohdc_train.models import Detector, MaskRCNN, detect
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,9 @@ def _report(file):
     return json.loads(file.with_name(file.name + ".json").read_text())
 
 
-def test_the_file_is_reported_equal_at_three_sizes_three_batches_without_detections_and_full(exported, opinionated):
+def test_the_file_is_reported_equal_at_three_sizes_three_batches_without_detections_and_full(
+    exported, opinionated
+):
     report = _report(exported)
     assert len({tuple(case["size"]) for case in report["cases"]}) >= 3
     assert {case["batch"] for case in report["cases"]} == {1, 2, 4}
@@ -78,7 +82,9 @@ def test_the_file_is_reported_equal_at_three_sizes_three_batches_without_detecti
 
 
 def test_gflops_of_a_detection_by_hand(exported, opinionated, small_config):
-    """Four 3x3 convolutions on 14x14 cells, a deconvolution to 28x28, and a 1x1 for background and two classes."""
+    """Four 3x3 convolutions on 14x14 cells, a deconvolution to 28x28, and a 1x1 for background and
+    two classes.
+    """
     without_cqe = count_flops(MaskRCNN(2, dataclasses.replace(small_config, cqe="off")).eval())
     c, cells = small_config.fpn_channels, 14 * 14
     flops = 2 * (4 * 9 * c * c * cells + 4 * c * c * cells + c * 3 * 4 * cells)
@@ -131,7 +137,12 @@ def test_another_canvas_than_the_trainings(checkpoint, opinionated, tmp_path):
 @pytest.mark.parametrize(
     ("cqe", "side", "cut"),
     [
-        *[("multiply", 28, "half"), ("add", 28, "half"), ("off", 28, "half"), ("concat", 56, "half")],
+        *[
+            ("multiply", 28, "half"),
+            ("add", 28, "half"),
+            ("off", 28, "half"),
+            ("concat", 56, "half"),
+        ],
         *[("add", 56, "half"), ("concat", 28, "quality")],
     ],
 )
@@ -139,9 +150,16 @@ def test_every_form_of_mask_and_quality_head_exports(cqe, side, cut, opinionated
     torch.manual_seed(0)
     config = dataclasses.replace(opinionated.config, cqe=cqe, mask_size=side, mask_cut=cut)
     module = MaskRCNNModule(["person", "car"], config)
-    rest = {name: value for name, value in opinionated.state_dict().items() if not name.startswith("cqe.")}
+    rest = {
+        name: value
+        for name, value in opinionated.state_dict().items()
+        if not name.startswith("cqe.")
+    }
     module.network.load_state_dict(rest, strict=False)
-    torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / f"{cqe}.ckpt")
+    torch.save(
+        {"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()},
+        tmp_path / f"{cqe}.ckpt",
+    )
     report = json.loads(export(tmp_path / f"{cqe}.ckpt").with_name("model.onnx.json").read_text())
     assert report["detections_compared"] > 20
     assert report["max_difference"]["quality"] <= 1e-3
@@ -152,16 +170,29 @@ def test_every_form_of_mask_and_quality_head_exports(cqe, side, cut, opinionated
 @pytest.mark.parametrize("backbone", ["mobilenet_v1", "mobilenet_v2"])
 def test_a_pyramid_from_stride_8_on_a_light_backbone_exports(backbone, small_config, tmp_path):
     torch.manual_seed(0)
-    changed = {"backbone": backbone, "finest_stride": 8, "anchor_scales": (32, 64, 128), "score_threshold": 0.1}
+    changed = {
+        "backbone": backbone,
+        "finest_stride": 8,
+        "anchor_scales": (32, 64, 128),
+        "score_threshold": 0.1,
+    }
     config = dataclasses.replace(small_config, rates=((1,),) * 4, **changed)
     module = MaskRCNNModule(["person", "car"], config)
     with torch.no_grad():
-        pictures = [torch.from_numpy(cv2.resize(p, (128, 96))).permute(2, 0, 1) / 255 for p in drawn_images(4)]
-        for _ in range(30):  # without statistics of pictures, a deep random network is nearly constant
+        pictures = [
+            torch.from_numpy(cv2.resize(p, (128, 96))).permute(2, 0, 1) / 255
+            for p in drawn_images(4)
+        ]
+        for _ in range(
+            30
+        ):  # without statistics of pictures, a deep random network is nearly constant
             module.network.train().features(torch.stack(pictures))
         module.network.eval().rpn.head.bbox_pred.weight.mul_(10)
         module.network.rpn.head.cls_logits.weight.mul_(3)
-    torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / "light.ckpt")
+    torch.save(
+        {"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()},
+        tmp_path / "light.ckpt",
+    )
     assert _report(export(tmp_path / "light.ckpt"))["detections_compared"] > 20
 
 
@@ -172,7 +203,10 @@ def test_a_hundred_detections_in_one_image(opinionated, tmp_path):
     )
     module = MaskRCNNModule(["person", "car"], config)
     module.network.load_state_dict(opinionated.state_dict())
-    torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, tmp_path / "many.ckpt")
+    torch.save(
+        {"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()},
+        tmp_path / "many.ckpt",
+    )
     assert _report(export(tmp_path / "many.ckpt"))["most_detections"] == 100
 
 
@@ -192,14 +226,18 @@ def test_export_replaces_its_own_file(checkpoint, written, tmp_path):
 
 
 def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, monkeypatch):
-    """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the folder."""
+    """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the
+    folder.
+    """
 
     monkeypatch.setitem(parity.TOLERANCES, "masks", 0.0)
     with pytest.raises(ExportError, match=r"m\.onnx: masks differ from torch by"):
         export(checkpoint, tmp_path / "m.onnx")
     monkeypatch.setitem(parity.TOLERANCES, "masks", 1e-3)
     monkeypatch.setattr(parity, "LEAST_MASK_IOU", 1.01)
-    with pytest.raises(ExportError, match=r"m\.onnx: a mask's IoU with torch's is .* at least 1.01 wanted"):
+    with pytest.raises(
+        ExportError, match=r"m\.onnx: a mask's IoU with torch's is .* at least 1.01 wanted"
+    ):
         export(checkpoint, tmp_path / "m.onnx")
     assert list(tmp_path.iterdir()) == []
 
@@ -217,7 +255,9 @@ def test_wrong_masks_and_other_detections_are_seen(opinionated, exported):
 
 
 def test_pictures_that_hinge_on_rounding_decide_nothing_and_are_few(opinionated):
-    """A network whose threshold is the score of something it finds differs from itself, an ordinary one does not."""
+    """A network whose threshold is the score of something it finds differs from itself, an ordinary
+    one does not.
+    """
     (picture,) = drawn_images(1)
 
     def found_by(detector):
@@ -232,11 +272,15 @@ def test_pictures_that_hinge_on_rounding_decide_nothing_and_are_few(opinionated)
     assert parity._hinges_on_rounding(edge, picture, found_by(edge))
     few = parity.Parity(images=7) | parity.Parity(images=1, undecided=1)
     few.require("m.onnx")
-    with pytest.raises(ExportError, match=r"m\.onnx: what torch finds hinges on rounding in 3 of 10 images"):
+    with pytest.raises(
+        ExportError, match=r"m\.onnx: what torch finds hinges on rounding in 3 of 10 images"
+    ):
         (few | parity.Parity(images=2, undecided=2)).require("m.onnx")
 
 
-def test_verify_only_finds_the_checkpoint_and_sees_that_it_changed(checkpoint, exported, tmp_path, capsys):
+def test_verify_only_finds_the_checkpoint_and_sees_that_it_changed(
+    checkpoint, exported, tmp_path, capsys
+):
     kept = tmp_path / "best.ckpt"
     shutil.copyfile(checkpoint, kept)
     file, report = tmp_path / "model.onnx", _report(exported)
@@ -273,8 +317,14 @@ def test_int8_keeps_the_contract_and_says_what_it_scores(checkpoint, written, fo
     assert small["bytes"] < 0.6 * whole["bytes"]
     graph = onnx.load(tmp_path / "model.int8.onnx").graph
     made = {output: node for node in graph.node for output in node.output}
-    fed = {node.name: made[node.input[0]].op_type for node in graph.node if node.op_type in ("Conv", "ConvTranspose")}
-    weights = {node.name: node.input[1] for node in graph.node if node.op_type in ("Conv", "ConvTranspose")}
+    fed = {
+        node.name: made[node.input[0]].op_type
+        for node in graph.node
+        if node.op_type in ("Conv", "ConvTranspose")
+    }
+    weights = {
+        node.name: node.input[1] for node in graph.node if node.op_type in ("Conv", "ConvTranspose")
+    }
     floats = [name for name, origin in fed.items() if origin != "DequantizeLinear"]
     assert floats
     assert all("mask_predictor" in weights[name] or "cqe" in weights[name] for name in floats)
@@ -284,8 +334,13 @@ def test_int8_keeps_the_contract_and_says_what_it_scores(checkpoint, written, fo
     dense = [numbers[made[name].input[0]] for name in heavy if name in made]
     assert len(dense) > 20
     assert {array.dtype for array in dense} == {np.dtype(np.int8)}
-    assert {int(np.abs(array.astype(int)).max()) for array in dense} == {64}  # 255 * 64 * 2 fits into 16 bits
-    assert Segmenter(tmp_path / "model.int8.onnx")(drawn_images(1)[0]).class_names == ("person", "car")
+    assert {int(np.abs(array.astype(int)).max()) for array in dense} == {
+        64
+    }  # 255 * 64 * 2 fits into 16 bits
+    assert Segmenter(tmp_path / "model.int8.onnx")(drawn_images(1)[0]).class_names == (
+        "person",
+        "car",
+    )
     assert main(["export", "--verify-only", str(tmp_path / "model.int8.onnx")]) == 1
 
 
@@ -300,28 +355,38 @@ def test_int8_that_loses_too_much_is_refused(checkpoint, written, folder, tmp_pa
             return dict.fromkeys(command.SCORES, scores["model.onnx"])
 
         def file(self, path):
-            return dict.fromkeys(command.SCORES, scores[path.name.lstrip(".").rsplit(".", 2)[0].removesuffix(".tmp")])
+            return dict.fromkeys(
+                command.SCORES, scores[path.name.lstrip(".").rsplit(".", 2)[0].removesuffix(".tmp")]
+            )
 
     monkeypatch.setattr(command, "Scorer", Judge)
     calibration = folder / "images"
     with pytest.raises(CohdcError, match=r"int8 needs --data"):
         export(checkpoint, tmp_path / "model.onnx", int8=calibration)
-    with pytest.raises(ExportError, match=r"model\.int8\.onnx: mask AP falls by 0\.020 in int8, allowed 0\.01"):
+    with pytest.raises(
+        ExportError, match=r"model\.int8\.onnx: mask AP falls by 0\.020 in int8, allowed 0\.01"
+    ):
         export(checkpoint, tmp_path / "model.onnx", data=folder, int8=calibration)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["model.onnx", "model.onnx.json"]
     export(checkpoint, tmp_path / "model.onnx", data=folder, int8=calibration, allow_drop=True)
     assert (tmp_path / "model.int8.onnx").is_file()
 
 
-def test_a_file_that_scores_otherwise_is_refused(checkpoint, written, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(command.Scorer, "file", lambda self, path: dict.fromkeys(command.SCORES, 0.5))
+def test_a_file_that_scores_otherwise_is_refused(
+    checkpoint, written, folder, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        command.Scorer, "file", lambda self, path: dict.fromkeys(command.SCORES, 0.5)
+    )
     with pytest.raises(ExportError, match=r"m\.onnx: mask AP differs from torch's by"):
         export(checkpoint, tmp_path / "m.onnx", data=folder)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_validate_takes_the_file(exported, folder, tmp_path, capsys):
-    assert main(["validate", str(exported), str(folder), "--out", str(tmp_path / "scores.json")]) == 0
+    assert (
+        main(["validate", str(exported), str(folder), "--out", str(tmp_path / "scores.json")]) == 0
+    )
     assert "boundary_AP" in capsys.readouterr().out
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert 0 <= scores["segm_AP50"] <= 1
@@ -350,7 +415,10 @@ def test_a_foreign_file_is_no_segmenter(tmp_path):
     ("break_it", "message"),
     [
         (lambda m: m.metadata_props.pop(0), "metadata cohdc"),
-        (lambda m: setattr(m.metadata_props[0], "value", "99"), "contract 99, this version reads 1"),
+        (
+            lambda m: setattr(m.metadata_props[0], "value", "99"),
+            "contract 99, this version reads 1",
+        ),
         (lambda m: setattr(m.graph.output[0], "name", "boxez"), "output boxes is missing"),
     ],
 )

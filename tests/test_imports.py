@@ -43,10 +43,29 @@ ALLOWED: dict[str, set[str]] = {
     "cli": {"errors"},  # and any verb's module, by name inside the call
 }
 ALLOWED["demo"] = set(ALLOWED) - {"cli", "__main__"}
-# The program's name and version, and whole-file writing, which import only the errors: any room may use them.
+# The program's name and version, and whole-file writing, which import only the errors: any room may
+# use them.
 FREE = {"__init__", "files"}
-WITHOUT_TORCH = ("slam", "segmenter", "prediction", "trajectory", "contour", "report", "env", "masks", "cli")
-TORCH = {"torch", "torchvision", "lightning", "pytorch_lightning", "kornia", "onnxscript", "torchmetrics"}
+WITHOUT_TORCH = (
+    "slam",
+    "segmenter",
+    "prediction",
+    "trajectory",
+    "contour",
+    "report",
+    "env",
+    "masks",
+    "cli",
+)
+TORCH = {
+    "torch",
+    "torchvision",
+    "lightning",
+    "pytorch_lightning",
+    "kornia",
+    "onnxscript",
+    "torchmetrics",
+}
 
 
 def sources(package: Path) -> Iterator[tuple[str, str, Path]]:
@@ -57,7 +76,8 @@ def sources(package: Path) -> Iterator[tuple[str, str, Path]]:
 
 
 def imported(file: Path, package: Path) -> Iterator[tuple[int, str]]:
-    """(line, absolute dotted name) of every import in a file, wherever in it; relative ones are resolved.
+    """(line, absolute dotted name) of every import in a file, wherever in it; relative ones are
+    resolved.
 
     `from a import b` gives a.b, since b may be a module.
     """
@@ -72,11 +92,15 @@ def imported(file: Path, package: Path) -> Iterator[tuple[int, str]]:
 
 
 def edges(package: Path) -> dict[str, set[tuple[str, str]]]:
-    """Room -> {(room or foreign package it imports, place)}; foreign ones are written with a leading `/`."""
+    """Room -> {(room or foreign package it imports, place)}; foreign ones are written with a
+    leading `/`.
+    """
     rooms = {room for room, _, _ in sources(package)}
     graph: dict[str, set[tuple[str, str]]] = {room: set() for room in rooms}
     for room, _, file in sources(package):
-        if room == "__init__":  # its public names are loaded when used; test_public_api.py shows that nothing else is
+        if (
+            room == "__init__"
+        ):  # its public names are loaded when used; test_public_api.py shows that nothing else is
             continue
         for line, name in imported(file, package):
             first, *rest = name.split(".")
@@ -124,7 +148,9 @@ def test_rooms_import_only_what_the_table_allows() -> None:
 
 
 def test_table_holds_no_cycle() -> None:
-    """The table itself goes one way: rooms can be put in an order in which each imports earlier ones only."""
+    """The table itself goes one way: rooms can be put in an order in which each imports earlier
+    ones only.
+    """
     placed: set[str] = set()
     while free := {room for room in ALLOWED if room not in placed and ALLOWED[room] <= placed}:
         placed |= free
@@ -152,14 +178,42 @@ HOUSE = {
 @pytest.mark.parametrize(
     ("file", "text", "fault"),
     [
-        ("slam/run.py", "import numpy\nimport torch\n", "slam reaches torch by slam (slam/run.py:2)"),
-        ("slam/run.py", "def f():\n    from torch.nn import Module\n", "slam reaches torch by slam (slam/run.py:2)"),
-        ("slam/run.py", "import kornia.geometry as g\n", "slam reaches kornia by slam (slam/run.py:1)"),
-        ("slam/run.py", "from cohdc_train.train.module import x\n", "slam/run.py:1: slam may not import train"),
-        ("slam/run.py", "from cohdc_train import train\n", "slam/run.py:1: slam may not import train"),
+        (
+            "slam/run.py",
+            "import numpy\nimport torch\n",
+            "slam reaches torch by slam (slam/run.py:2)",
+        ),
+        (
+            "slam/run.py",
+            "def f():\n    from torch.nn import Module\n",
+            "slam reaches torch by slam (slam/run.py:2)",
+        ),
+        (
+            "slam/run.py",
+            "import kornia.geometry as g\n",
+            "slam reaches kornia by slam (slam/run.py:1)",
+        ),
+        (
+            "slam/run.py",
+            "from cohdc_train.train.module import x\n",
+            "slam/run.py:1: slam may not import train",
+        ),
+        (
+            "slam/run.py",
+            "from cohdc_train import train\n",
+            "slam/run.py:1: slam may not import train",
+        ),
         ("slam/run.py", "from ..train import module\n", "slam/run.py:1: slam may not import train"),
-        ("slam/run.py", "import cohdc_train.train.module\n", "slam reaches torch by slam -> train (train/module.py:1)"),
-        ("slam/run.py", "from .. import train\n", "slam reaches torch by slam -> train (train/module.py:1)"),
+        (
+            "slam/run.py",
+            "import cohdc_train.train.module\n",
+            "slam reaches torch by slam -> train (train/module.py:1)",
+        ),
+        (
+            "slam/run.py",
+            "from .. import train\n",
+            "slam reaches torch by slam -> train (train/module.py:1)",
+        ),
         ("masks.py", "import torch\n", "masks reaches torch by masks (masks.py:1)"),
         ("utils.py", "", "utils is not in the table of rooms"),
     ],
@@ -233,7 +287,9 @@ def test_rooms_of_slam_import_in_one_direction() -> None:
 def test_import_against_the_order_of_slam_is_found(tmp_path: Path) -> None:
     room = tmp_path / NAME / "slam" / "mapping"
     room.mkdir(parents=True)
-    (room / "map.py").write_text(f"from {NAME}.slam.tracking.tracker import Tracker\n", encoding="utf-8")
+    (room / "map.py").write_text(
+        f"from {NAME}.slam.tracking.tracker import Tracker\n", encoding="utf-8"
+    )
     (fault,) = slam_faults(tmp_path / NAME / "slam")
     assert fault == "mapping/map.py:1: mapping imports tracking"
 

@@ -8,7 +8,9 @@ from cohdc_train.masks import paste_roi_mask
 
 
 def test_a_full_mask_fills_exactly_the_pixels_whose_centre_is_in_the_box():
-    mask = paste_roi_mask(np.ones((28, 28), np.float32), np.array([2.5, 1.0, 6.4, 3.6], np.float32), (5, 9))
+    mask = paste_roi_mask(
+        np.ones((28, 28), np.float32), np.array([2.5, 1.0, 6.4, 3.6], np.float32), (5, 9)
+    )
     expected = np.zeros((5, 9), bool)
     expected[1:4, 2:6] = True  # centres 1.5, 2.5, 3.5 and 2.5 .. 5.5
     np.testing.assert_array_equal(mask, expected)
@@ -39,5 +41,7 @@ def test_a_box_outside_the_image_or_without_area_is_empty():
 
 
 def test_a_box_across_the_border_keeps_its_visible_part():
-    mask = paste_roi_mask(np.ones((28, 28), np.float32), np.array([-10, -10, 5, 5], np.float32), (20, 20))
+    mask = paste_roi_mask(
+        np.ones((28, 28), np.float32), np.array([-10, -10, 5, 5], np.float32), (20, 20)
+    )
     assert mask.sum() == 25

@@ -30,14 +30,25 @@ def draw_sequence(folder: Path, frames: int = 12) -> None:
         poses[index, 0, 3] = index * step
         shift = focal * index * step / depth_m
         view = cv2.warpAffine(wall, np.array([[1, 0, -shift], [0, 1, 0]], float), size[::-1])
-        images = {"rgb": cv2.cvtColor(view, cv2.COLOR_GRAY2BGR), "depth": np.full(size, 5000 * depth_m, np.uint16)}
+        images = {
+            "rgb": cv2.cvtColor(view, cv2.COLOR_GRAY2BGR),
+            "depth": np.full(size, 5000 * depth_m, np.uint16),
+        }
         for kind, image in images.items():
             (folder / kind).mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(folder / kind / f"{index / 30:.6f}.png"), image)
             lists[kind].append(f"{index / 30:.6f} {kind}/{index / 30:.6f}.png")
     for kind, lines in lists.items():
         (folder / f"{kind}.txt").write_text("\n".join(lines))
-    camera = {"fx": focal, "fy": focal, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240, "depth_scale": 5000}
+    camera = {
+        "fx": focal,
+        "fy": focal,
+        "cx": 159.5,
+        "cy": 119.5,
+        "width": 320,
+        "height": 240,
+        "depth_scale": 5000,
+    }
     (folder / "camera.yaml").write_text(json.dumps(camera))  # JSON is YAML
     write_tum(folder / "groundtruth.txt", Trajectory(np.arange(frames) / 30, poses))
 
@@ -52,7 +63,11 @@ class Clean:
         (folder / "elsewhere").mkdir()
 
     def run(self, *command: str, expect: int = 0) -> str:
-        kept = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        kept = {
+            key: value
+            for key, value in os.environ.items()
+            if key not in ("PYTHONPATH", "VIRTUAL_ENV")
+        }
         done = subprocess.run(
             [str(self.bin / command[0]), *command[1:]],
             cwd=self.folder / "elsewhere",
@@ -72,14 +87,18 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Clean:
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = folder.glob("cohdc_train-*.whl")
     environment = Clean(folder)
-    environment.run("python", "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel))
+    environment.run(
+        "python", "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel)
+    )
     return environment
 
 
 @pytest.mark.slow
 def test_wheel_runs_outside_the_repository_without_torch(clean: Clean) -> None:
     assert "evaluate" in clean.run("cohdc", "--help")
-    code = "import cohdc_train, importlib.util as u; print(cohdc_train.__file__, u.find_spec('torch'))"
+    code = (
+        "import cohdc_train, importlib.util as u; print(cohdc_train.__file__, u.find_spec('torch'))"
+    )
     where, torch = clean.run("python", "-c", code).split()
     assert Path(where).is_relative_to(clean.folder)
     assert torch == "None"
@@ -88,15 +107,22 @@ def test_wheel_runs_outside_the_repository_without_torch(clean: Clean) -> None:
 
 @pytest.mark.slow
 def test_wheel_holds_the_configurations(clean: Clean) -> None:
-    names = [str(path.relative_to(ROOT / "configs")) for path in sorted((ROOT / "configs").rglob("*.yaml"))]
+    names = [
+        str(path.relative_to(ROOT / "configs"))
+        for path in sorted((ROOT / "configs").rglob("*.yaml"))
+    ]
     assert {"slam/freiburg1.yaml", "table3/test10.yaml"} <= set(names)
     show = "print(config_path(name).read_text(), end='')"
     code = f"from cohdc_train.presets import config_path\nfor name in {names}: {show}"
-    assert clean.run("python", "-c", code) == "".join((ROOT / "configs" / name).read_text() for name in names)
+    assert clean.run("python", "-c", code) == "".join(
+        (ROOT / "configs" / name).read_text() for name in names
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["fit", "validate", "demo", "data", "synth sequence folder", "export run.ckpt"])
+@pytest.mark.parametrize(
+    "command", ["fit", "validate", "demo", "data", "synth sequence folder", "export run.ckpt"]
+)
 def test_wheel_names_the_missing_extra(clean: Clean, command: str) -> None:
     (clean.folder / "elsewhere" / "run.ckpt").touch()
     said = clean.run("cohdc", *command.split(), expect=1)
@@ -112,9 +138,13 @@ def test_wheel_tracks_and_scores_a_sequence(clean: Clean) -> None:
     metrics = json.loads((elsewhere / "run" / "metrics.json").read_text())
     assert metrics["coverage"] == 1.0
     assert metrics["ate_m"]["rmse"] < 0.01
-    clean.run("cohdc", "evaluate", "wall/groundtruth.txt", "run/trajectory.txt", "--out", "scores.json")
+    clean.run(
+        "cohdc", "evaluate", "wall/groundtruth.txt", "run/trajectory.txt", "--out", "scores.json"
+    )
     scores = json.loads((elsewhere / "scores.json").read_text())
-    assert scores["ate_m"] == pytest.approx(metrics["ate_m"], abs=1e-9)  # of what the file rounds, m
+    assert scores["ate_m"] == pytest.approx(
+        metrics["ate_m"], abs=1e-9
+    )  # of what the file rounds, m
     assert scores["pairs"] == 12
 
 
@@ -124,10 +154,19 @@ def test_wheel_tracks_and_scores_a_sequence(clean: Clean) -> None:
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.stem)
 def test_dockerfile_copies_what_exists_and_pins(dockerfile: Path) -> None:
     steps = load_tool("../.ci/check_docker").instructions(dockerfile)
-    copied = [name for instruction, argument in steps if instruction == "COPY" for name in argument.split()[:-1]]
+    copied = [
+        name
+        for instruction, argument in steps
+        if instruction == "COPY"
+        for name in argument.split()[:-1]
+    ]
     assert copied
     assert [name for name in copied if not (ROOT / name).exists()] == []
-    installs = [argument for instruction, argument in steps if instruction == "RUN" and "pip install" in argument]
+    installs = [
+        argument
+        for instruction, argument in steps
+        if instruction == "RUN" and "pip install" in argument
+    ]
     assert installs
     assert all("-c constraints.txt" in argument for argument in installs)
     assert any("[train]" in argument for argument in installs) == (dockerfile.stem == "train")
@@ -156,5 +195,7 @@ def test_checker_follows_a_dockerfile(tmp_path: Path, monkeypatch: pytest.Monkey
 
 @pytest.mark.slow
 def test_slam_dockerfile_installs_in_a_clean_environment() -> None:
-    done = subprocess.run([sys.executable, str(ROOT / ".ci" / "check_docker"), "slam"], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "check_docker"), "slam"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]

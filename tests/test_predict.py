@@ -1,4 +1,6 @@
-"""`cohdc predict` with a network that answers from the image's brightness: files, filters, drawing, readers."""
+"""`cohdc predict` with a network that answers from the image's brightness: files, filters, drawing,
+readers.
+"""
 
 import json
 from pathlib import Path
@@ -16,11 +18,15 @@ from cohdc_train.prediction.image_sources import Picture, read_pictures
 from cohdc_train.prediction.predict import predict, predict_pictures
 from cohdc_train.segmenter import Detections
 
-BOXES = np.array([[20.0, 10.0, 60.0, 90.0], [70.5, 40.0, 110.5, 60.0], [5.0, 95.0, 9.0, 99.0]], np.float32)
+BOXES = np.array(
+    [[20.0, 10.0, 60.0, 90.0], [70.5, 40.0, 110.5, 60.0], [5.0, 95.0, 9.0, 99.0]], np.float32
+)
 
 
 class Fake:
-    """Finds three objects in every image: an oval with a hole, an oval, and one whose mask is empty."""
+    """Finds three objects in every image: an oval with a hole, an oval, and one whose mask is
+    empty.
+    """
 
     class_names = ("person", "car")
 
@@ -70,20 +76,28 @@ def test_polygons_keep_the_floor(tmp_path: Path) -> None:
         assert annotation["area"] == pytest.approx(mask.sum(), rel=0.1)
 
 
-@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools under numpy 2
+@pytest.mark.filterwarnings(
+    "ignore:__array__ implementation:DeprecationWarning"
+)  # pycocotools under numpy 2
 def test_pycocotools_loads_the_file(tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools comes with the train extra")
     one = picture()
     predict_pictures([one], Fake(), tmp_path, iou_floor=1.0, contour="bisection")
     loaded = coco.COCO(str(tmp_path / "predictions.json"))
-    masks = [loaded.annToMask(annotation).astype(bool) for annotation in loaded.loadAnns(loaded.getAnnIds())]
+    masks = [
+        loaded.annToMask(annotation).astype(bool)
+        for annotation in loaded.loadAnns(loaded.getAnnIds())
+    ]
     assert np.array_equal(masks, Fake()(one.rgb).masks()[:2])
 
 
 @pytest.mark.parametrize(
-    ("least", "left"), [((0.5, None), [0.9, 0.6]), ((0.7, None), [0.9]), ((0.5, 0.5), [0.9]), ((0.95, None), [])]
+    ("least", "left"),
+    [((0.5, None), [0.9, 0.6]), ((0.7, None), [0.9]), ((0.5, 0.5), [0.9]), ((0.95, None), [])],
 )
-def test_score_and_quality_filter(tmp_path: Path, least: tuple[float, float | None], left: list[float]) -> None:
+def test_score_and_quality_filter(
+    tmp_path: Path, least: tuple[float, float | None], left: list[float]
+) -> None:
     result = predict_pictures([picture()], Fake(), tmp_path, least)
     assert [annotation["score"] for annotation in result["annotations"]] == pytest.approx(left)
     assert (tmp_path / "room_overlay.jpg").is_file()
@@ -127,7 +141,11 @@ def test_video_frames_are_read(tmp_path: Path) -> None:
         writer.write(np.full((48, 64, 3), grey, np.uint8))
     writer.release()
     frames = list(read_pictures(file))
-    assert [frame.name for frame in frames] == ["walk_000000.jpg", "walk_000001.jpg", "walk_000002.jpg"]
+    assert [frame.name for frame in frames] == [
+        "walk_000000.jpg",
+        "walk_000001.jpg",
+        "walk_000002.jpg",
+    ]
     assert [round(float(frame.rgb.mean()), -1) for frame in frames] == [10, 120, 230]
 
 
@@ -146,10 +164,15 @@ class _Webcam:
         _Webcam.released += 1
 
 
-def test_a_webcam_is_a_number_and_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_webcam_is_a_number_and_has_an_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cv2, "VideoCapture", _Webcam)
     monkeypatch.chdir(tmp_path)
-    assert [picture.name for picture in read_pictures(Path("0"), 2)] == ["webcam0_000000.jpg", "webcam0_000001.jpg"]
+    assert [picture.name for picture in read_pictures(Path("0"), 2)] == [
+        "webcam0_000000.jpg",
+        "webcam0_000001.jpg",
+    ]
     assert len(list(read_pictures(Path("0")))) == 100
     with pytest.raises(DataError, match=r"webcam7: no picture comes out of it"):
         list(read_pictures(Path("7")))

@@ -1,4 +1,6 @@
-"""The files `cohdc predict` writes, read back by the converters: the same objects, their masks above the floor."""
+"""The files `cohdc predict` writes, read back by the converters: the same objects, their masks
+above the floor.
+"""
 
 import json
 from collections.abc import Iterable
@@ -36,7 +38,9 @@ def holds_what_was_found(found: list[tuple[str, Any]]) -> None:
     masks = Fake()(picture().rgb).masks()
     assert sorted(name for name, _ in found) == ["car", "person"]
     for name, mask in found:
-        assert iou(mask, masks[("person", "car").index(name)].astype(np.uint8)) >= FLOOR - 0.01  # pycocotools fills it
+        assert (
+            iou(mask, masks[("person", "car").index(name)].astype(np.uint8)) >= FLOOR - 0.01
+        )  # pycocotools fills it
 
 
 def test_labelme_files_come_back_as_the_same_objects(tmp_path: Path) -> None:
@@ -51,11 +55,35 @@ def test_labelme_files_come_back_as_the_same_objects(tmp_path: Path) -> None:
 def test_labelme_shapes_are_what_labelme_writes_and_the_doubtful_come_first(tmp_path: Path) -> None:
     written(tmp_path / "out", photographs(tmp_path / "photos"), format="labelme", check_below=0.5)
     content = json.loads((tmp_path / "out" / "a.json").read_text())
-    assert set(content) == {"version", "flags", "shapes", "imagePath", "imageData", "imageHeight", "imageWidth"}
-    assert (content["imagePath"], content["imageHeight"], content["imageWidth"]) == ("../photos/a.png", 100, 120)
+    assert set(content) == {
+        "version",
+        "flags",
+        "shapes",
+        "imagePath",
+        "imageData",
+        "imageHeight",
+        "imageWidth",
+    }
+    assert (content["imagePath"], content["imageHeight"], content["imageWidth"]) == (
+        "../photos/a.png",
+        100,
+        120,
+    )
     first, second = content["shapes"]
-    assert set(first) == {"label", "points", "group_id", "shape_type", "mask", "description", "flags"}
-    assert (first["label"], first["flags"], first["description"]) == ("car", {"check": True}, "score 0.60 quality 0.30")
+    assert set(first) == {
+        "label",
+        "points",
+        "group_id",
+        "shape_type",
+        "mask",
+        "description",
+        "flags",
+    }
+    assert (first["label"], first["flags"], first["description"]) == (
+        "car",
+        {"check": True},
+        "score 0.60 quality 0.30",
+    )
     assert (second["label"], second["flags"]) == ("person", {"check": False})
     assert all(len(point) == 2 for point in first["points"])
     assert (tmp_path / "out" / "review.txt").read_text().splitlines() == [
@@ -115,7 +143,9 @@ def test_yolo_labels_come_back_as_the_same_objects(tmp_path: Path) -> None:
     assert all(0 <= float(value) <= 1 for line in lines for value in line.split()[1:])
     (root / "last.txt").write_text("images/c.png\nimages/d.png\n")
     (root / "first.txt").write_text("images/a.png\nimages/b.png\n")
-    (root / "data.yaml").write_text(yaml.safe_dump(names | {"train": "first.txt", "val": "last.txt"}))
+    (root / "data.yaml").write_text(
+        yaml.safe_dump(names | {"train": "first.txt", "val": "last.txt"})
+    )
     splits = converted("yolo", root)
     for name in "abcd":
         holds_what_was_found(masks_of(splits, name))
@@ -126,8 +156,14 @@ def test_fewer_vertices_make_smaller_files(tmp_path: Path, format: Any) -> None:
     sizes = {}
     for floor in (0.9, 1.0):
         folder = tmp_path / str(floor)
-        predict_pictures([picture()], Fake(), folder, iou_floor=floor, format=format, contour="bas_dp")
-        files = [file for file in folder.rglob("*") if file.suffix in (".json", ".txt") and file.name != "review.txt"]
+        predict_pictures(
+            [picture()], Fake(), folder, iou_floor=floor, format=format, contour="bas_dp"
+        )
+        files = [
+            file
+            for file in folder.rglob("*")
+            if file.suffix in (".json", ".txt") and file.name != "review.txt"
+        ]
         sizes[floor] = sum(file.stat().st_size for file in files)
     assert sizes[0.9] < sizes[1.0]
 

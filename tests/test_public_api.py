@@ -15,7 +15,13 @@ CODE = "import sys, cohdc_train; cohdc_train.{name}; print('torch' in sys.module
 TINY = {
     "data.canvas": [48, 64],
     "data.workers": 0,
-    "model.network": {"depth": 18, "width": 0.125, "fpn_channels": 8, "fc": 16, "anchor_scales": [8, 16, 32, 64]},
+    "model.network": {
+        "depth": 18,
+        "width": 0.125,
+        "fpn_channels": 8,
+        "fc": 16,
+        "anchor_scales": [8, 16, 32, 64],
+    },
     "pretrained": "none",
     "trainer.accelerator": "cpu",
     "trainer.precision": "32-true",
@@ -26,7 +32,9 @@ TINY = {
 
 def loaded(name: str) -> list[str]:
     """Return whether torch and numpy are loaded after one name was, in a new process."""
-    done = subprocess.run([sys.executable, "-c", CODE.format(name=name)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", CODE.format(name=name)], capture_output=True, text=True, check=True
+    )
     return done.stdout.split()
 
 

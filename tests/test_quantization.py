@@ -1,4 +1,6 @@
-"""Static quantisation of a MobileNet block behind a stem: what is rounded how, and that nothing saturates."""
+"""Static quantisation of a MobileNet block behind a stem: what is rounded how, and that nothing
+saturates.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,8 @@ CHANNELS = 8
 
 
 def block(path: Path, stem: bool = True) -> None:
-    """uint8 pictures -> float -> a stem that changes nothing -> 3x3 convolution, ReLU6, depthwise convolution, ReLU6,
-    1x1 convolution.
+    """uint8 pictures -> float -> a stem that changes nothing -> 3x3 convolution, ReLU6, depthwise
+    convolution, ReLU6, 1x1 convolution.
 
     stem: whether its second convolution is depthwise; else it is one ordinary convolution.
     """
@@ -27,7 +29,9 @@ def block(path: Path, stem: bool = True) -> None:
         "scale": np.float32(1 / 255),
         "zero": np.float32(0),
         "six": np.float32(6),
-        "dense": rng.uniform(0, 0.3, (CHANNELS, 3, 3, 3)).astype(np.float32),  # all of one sign: sums grow
+        "dense": rng.uniform(0, 0.3, (CHANNELS, 3, 3, 3)).astype(
+            np.float32
+        ),  # all of one sign: sums grow
         "depthwise": rng.normal(0, 0.4, (CHANNELS, 1, 3, 3)).astype(np.float32),
         "pointwise": rng.uniform(0, 1, (CHANNELS, CHANNELS, 1, 1)).astype(np.float32),
         "same": np.eye(3, dtype=np.float32).reshape(3, 3, 1, 1),
@@ -49,15 +53,21 @@ def block(path: Path, stem: bool = True) -> None:
         *(light if stem else heavy),
         helper.make_node("Conv", ["x", "dense"], ["a"], "first", group=1, pads=[1, 1, 1, 1]),
         helper.make_node("Clip", ["a", "zero", "six"], ["b"], "relu6"),
-        helper.make_node("Conv", ["b", "depthwise"], ["c"], "second", group=CHANNELS, pads=[1, 1, 1, 1]),
+        helper.make_node(
+            "Conv", ["b", "depthwise"], ["c"], "second", group=CHANNELS, pads=[1, 1, 1, 1]
+        ),
         helper.make_node("Clip", ["c", "zero", "six"], ["d"], "another"),
         helper.make_node("Conv", ["d", "pointwise"], ["y"], "third", group=1),
     ]
-    picture = helper.make_tensor_value_info(signature.INPUT, onnx.TensorProto.UINT8, [1, "h", "w", 3])
+    picture = helper.make_tensor_value_info(
+        signature.INPUT, onnx.TensorProto.UINT8, [1, "h", "w", 3]
+    )
     result = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, None)
     tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in numbers.items()]
     graph = helper.make_graph(nodes, "block", [picture], [result], tensors)
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+    onnx.save(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path
+    )
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +100,22 @@ def test_relu6_is_left_to_the_rounding_behind_it(made: tuple[Path, Path, Any]) -
     assert sorted(rounded) == ["Conv", "Conv", "Conv", "Conv"]
 
 
-def test_a_light_stem_stays_exact_and_a_heavy_one_does_not(made: tuple[Path, Path, Any], tmp_path: Path) -> None:
+def test_a_light_stem_stays_exact_and_a_heavy_one_does_not(
+    made: tuple[Path, Path, Any], tmp_path: Path
+) -> None:
     def float_convolutions(path: Path) -> list[str]:
         graph = onnx.load(path).graph
-        rounded = {output for node in graph.node if node.op_type == "DequantizeLinear" for output in node.output}
-        return [node.name for node in graph.node if node.op_type == "Conv" and node.input[1] not in rounded]
+        rounded = {
+            output
+            for node in graph.node
+            if node.op_type == "DequantizeLinear"
+            for output in node.output
+        }
+        return [
+            node.name
+            for node in graph.node
+            if node.op_type == "Conv" and node.input[1] not in rounded
+        ]
 
     assert float_convolutions(made[1]) == ["stem1", "stem2", "stem3"]
     block(tmp_path / "heavy.onnx", stem=False)
@@ -103,13 +124,23 @@ def test_a_light_stem_stays_exact_and_a_heavy_one_does_not(made: tuple[Path, Pat
 
 
 def test_no_sum_saturates(made: tuple[Path, Path, list[NDArray[np.uint8]]]) -> None:
-    """The same as in float32 arithmetic with the same rounded numbers, and near the float32 network's."""
+    """The same as in float32 arithmetic with the same rounded numbers, and near the float32
+    network's.
+    """
     whole, small, pictures = made
     exact = SessionOptions()
     exact.add_session_config_entry("session.disable_quant_qdq", "1")
-    sessions = [InferenceSession(str(whole)), InferenceSession(str(small)), InferenceSession(str(small), exact)]
+    sessions = [
+        InferenceSession(str(whole)),
+        InferenceSession(str(small)),
+        InferenceSession(str(small), exact),
+    ]
     for picture in pictures:
-        truth, found, expected = (s.run(None, {signature.INPUT: picture[None]})[0] for s in sessions)
+        truth, found, expected = (
+            s.run(None, {signature.INPUT: picture[None]})[0] for s in sessions
+        )
         step = expected.max() / 255
-        assert np.abs(found - expected).max() <= 2.1 * step  # a rounding that goes the other way, and one behind it
+        assert (
+            np.abs(found - expected).max() <= 2.1 * step
+        )  # a rounding that goes the other way, and one behind it
         assert np.abs(found - truth).mean() < 0.02 * truth.max()

@@ -20,15 +20,21 @@ LIGHTNING = ("fit",)  # Lightning parses it by itself
 
 
 def commands(text: str) -> list[list[str]]:
-    """The words after `cohdc` of every command in a text's code blocks, fenced or indented, and in its sentences.
+    """The words after `cohdc` of every command in a text's code blocks, fenced or indented, and in
+    its sentences.
 
-    A sentence may speak of `cohdc VERB`; with options it is a command. Continued lines are joined, comments and
-    redirections dropped; a line counts when it, or what follows && or ;, begins with cohdc or a path to it.
+    A sentence may speak of `cohdc VERB`; with options it is a command. Continued lines are joined,
+    comments and redirections dropped; a line counts when it, or what follows && or ;, begins with
+    cohdc or a path to it.
     """
     fenced = re.findall(r"```[a-z]*\n(.*?)```", text, flags=re.DOTALL)
     plain = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     blocks = fenced + re.findall(r"^(?: {4}|\t)(.*)$", plain, flags=re.MULTILINE)
-    blocks += [said for said in re.findall(r"`([^`]+)`", plain) if said.startswith("cohdc ") and " -" in said]
+    blocks += [
+        said
+        for said in re.findall(r"`([^`]+)`", plain)
+        if said.startswith("cohdc ") and " -" in said
+    ]
     found = []
     for line in "\n".join(blocks).replace("\\\n", " ").splitlines():
         for part in re.split(r"&&|\|\||[;|]", line):
@@ -68,17 +74,24 @@ COMMANDS = commands(README)
 
 
 @pytest.mark.parametrize(
-    "words", [words for words in COMMANDS if words[:1] not in [[v] for v in LIGHTNING]], ids=" ".join
+    "words",
+    [words for words in COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
+    ids=" ".join,
 )
 def test_command_parses(words: list[str]) -> None:
     assert check(words) == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [words for words in COMMANDS if words[:1] in [[v] for v in LIGHTNING]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [words for words in COMMANDS if words[:1] in [[v] for v in LIGHTNING]], ids=" ".join
+)
 def test_training_command_parses(words: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "cohdc_train", *words, "--print_config"], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "cohdc_train", *words, "--print_config"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
 
@@ -98,13 +111,17 @@ def test_commands_are_found_in_blocks() -> None:
     assert [" ".join(words) for words in commands(text)] == expected
 
 
-@pytest.mark.parametrize("line", ["fly", "evaluate one.txt", "evaluate a b --spin 3", "--helpp", "predict x --model m"])
+@pytest.mark.parametrize(
+    "line", ["fly", "evaluate one.txt", "evaluate a b --spin 3", "--helpp", "predict x --model m"]
+)
 def test_wrong_command_is_caught(line: str) -> None:
     assert check(line.split()) == 2
 
 
 def test_right_command_passes() -> None:
     assert check(["evaluate", "a.txt", "b.txt", "--out", "scores.json"]) == 0
-    assert check(["predict", "images", "--model", "m.onnx", "--out", "folder", "--score", "0.3"]) == 0
+    assert (
+        check(["predict", "images", "--model", "m.onnx", "--out", "folder", "--score", "0.3"]) == 0
+    )
     assert check(["synth", "sequence", "folder"]) == 0
     assert check(["slam", "--help"]) == 0

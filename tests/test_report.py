@@ -59,7 +59,9 @@ def run_folder(folder: Path, noise: float, pictures: bool = True) -> Path:
     metrics = {"coverage": 1.0, "frames": 60, "ms": {"track": {"p50": 11.25, "p95": 20.5}}}
     (folder / "metrics.json").write_text(json.dumps({**metrics, **score(trajectory(), estimate)}))
     for kind in ("before", "after") if pictures else ("before",):
-        cv2.imwrite(str(folder / "pictures" / f"100.5_{kind}.jpg"), np.full((48, 64, 3), 90, np.uint8))
+        cv2.imwrite(
+            str(folder / "pictures" / f"100.5_{kind}.jpg"), np.full((48, 64, 3), 90, np.uint8)
+        )
     return folder
 
 
@@ -72,7 +74,10 @@ def truth_file(tmp_path: Path) -> Path:
 def test_page_holds_everything_inside_itself(tmp_path: Path, truth_file: Path) -> None:
     overlay = tmp_path / "0001_overlay.jpg"
     cv2.imwrite(str(overlay), np.full((48, 64, 3), 200, np.uint8))
-    runs = {"without": run_folder(tmp_path / "a", 0.2, pictures=False), "with": run_folder(tmp_path / "b", 0.001)}
+    runs = {
+        "without": run_folder(tmp_path / "a", 0.2, pictures=False),
+        "with": run_folder(tmp_path / "b", 0.001),
+    }
     table = Table("Summary <of all>", ["what", "value"], [["AP50", "0.75"], ["a & b", "<1"]])
     write_report(tmp_path / "page" / "report.html", "Demo", truth_file, runs, [overlay], [table])
     page = Page((tmp_path / "page" / "report.html").read_text("utf-8"))
@@ -117,7 +122,9 @@ def test_same_run_same_page(tmp_path: Path, truth_file: Path) -> None:
 
 def test_lost_run_keeps_its_row_without_a_plot(tmp_path: Path, truth_file: Path) -> None:
     folder = run_folder(tmp_path / "lost", 0.0)
-    (folder / "metrics.json").write_text(json.dumps({"coverage": 0.0, "ms": {"track": {"p50": 1.0, "p95": 2.0}}}))
+    (folder / "metrics.json").write_text(
+        json.dumps({"coverage": 0.0, "ms": {"track": {"p50": 1.0, "p95": 2.0}}})
+    )
     (folder / "trajectory.txt").write_text("# nothing\n")
     write_report(tmp_path / "report.html", "Lost", truth_file, {"lost": folder})
     page = Page((tmp_path / "report.html").read_text("utf-8"))
@@ -172,7 +179,9 @@ def test_a_run_without_ground_truth_has_its_trajectory_all_the_same(tmp_path: Pa
     assert len(page.images) > 2
 
 
-@pytest.mark.parametrize("metrics", ["{}", "[]", '{"coverage": 1, "ms": [3]}', '{"coverage": 1, "ms": {"track": 3}}'])
+@pytest.mark.parametrize(
+    "metrics", ["{}", "[]", '{"coverage": 1, "ms": [3]}', '{"coverage": 1, "ms": {"track": 3}}']
+)
 def test_metrics_of_another_kind_are_named(tmp_path: Path, metrics: str) -> None:
     ours = run_folder(tmp_path / "run", 0.001)
     (ours / "config.yaml").write_text("sequence: null")
@@ -184,5 +193,7 @@ def test_metrics_of_another_kind_are_named(tmp_path: Path, metrics: str) -> None
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"config\.yaml: cannot be read; is .* a folder of cohdc slam"):
+    with pytest.raises(
+        DataError, match=r"config\.yaml: cannot be read; is .* a folder of cohdc slam"
+    ):
         report(tmp_path)

@@ -19,7 +19,9 @@ PROTOTYPES = 4
 
 
 def prototypes():
-    """[P, 16, 24]: everywhere, the left half, the upper half, and nowhere, as +-8 before the sigmoid."""
+    """[P, 16, 24]: everywhere, the left half, the upper half, and nowhere, as +-8 before the
+    sigmoid.
+    """
     maps = np.full((PROTOTYPES, CANVAS[0] // 4, CANVAS[1] // 4), -8.0, np.float32)
     maps[0], maps[1, :, :12], maps[2, :8] = 8, 8, 8
     return maps
@@ -33,14 +35,19 @@ def candidate(box, label, score, prototype):
 
 
 def yolo(path, table, names=CLASSES, free=False):
-    """A file whose candidates' boxes, scores and coefficients are `table` times the mean of the image's red channel."""
+    """A file whose candidates' boxes, scores and coefficients are `table` times the mean of the
+    image's red channel.
+    """
     table = np.asarray(table, np.float32)
     factor = np.ones_like(table)  # 1 where the table stands as it is
     if table.shape[0] == 4 + len(CLASSES) + PROTOTYPES:
         factor[4] = 0  # scores of the first class follow the red channel
     constants = {"fixed": table * factor, "red_part": table * (1 - factor), "protos": prototypes()}
     tensors = [numpy_helper.from_array(value[None], name) for name, value in constants.items()]
-    tensors += [numpy_helper.from_array(np.array(v, np.int64), n) for n, v in {"red": 0, "axes": [1, 2]}.items()]
+    tensors += [
+        numpy_helper.from_array(np.array(v, np.int64), n)
+        for n, v in {"red": 0, "axes": [1, 2]}.items()
+    ]
     nodes = [
         helper.make_node("Gather", ["images", "red"], ["plane"], axis=1),
         helper.make_node("ReduceMean", ["plane", "axes"], ["mean"], keepdims=1),
@@ -93,7 +100,9 @@ def test_yolo_boxes_masks_labels_and_suppression(tmp_path):
     found = file(red(128, 192))  # twice the canvas: no border
     assert [found.class_names[label] for label in found.labels] == ["person", "car", "dog"]
     np.testing.assert_allclose(found.scores, [0.9, 0.6, 0.4], atol=1e-6)
-    np.testing.assert_allclose(found.boxes, [[56, 24, 136, 104], [20, 16, 100, 64], [20, 16, 100, 64]], atol=1e-4)
+    np.testing.assert_allclose(
+        found.boxes, [[56, 24, 136, 104], [20, 16, 100, 64], [20, 16, 100, 64]], atol=1e-4
+    )
     person, car, dog = found.masks()
     expected = np.zeros((128, 192), bool)
     expected[24:104, 56:96] = True  # the prototype ends at column 12 of 24, the middle of the image
@@ -117,7 +126,8 @@ def test_yolo_letterbox_is_undone(tmp_path, size):
     height, width = size
     scale = min(CANVAS[0] / height, CANVAS[1] / width)
     table = columns(
-        candidate([48, 32, width * scale, height * scale], 1, 0.8, 0), candidate([48, 32, 96, 64], 2, 0.7, 0)
+        candidate([48, 32, width * scale, height * scale], 1, 0.8, 0),
+        candidate([48, 32, 96, 64], 2, 0.7, 0),
     )
     found = Segmenter(yolo(tmp_path / "y.onnx", table))(red(*size))
     np.testing.assert_allclose(found.boxes, [[0, 0, width, height]] * 2, atol=0.6 / scale)
@@ -135,7 +145,10 @@ def test_yolo_that_suppresses_by_itself(tmp_path):
 
 def test_yolo_finds_at_most_as_many_as_a_contract_file_and_may_find_none(tmp_path):
     many = columns(
-        *(candidate([8 + 2 * (i % 40), 8 + 6 * (i // 40), 1.5, 5], 1, 0.3 + i / 1000, 0) for i in range(300))
+        *(
+            candidate([8 + 2 * (i % 40), 8 + 6 * (i // 40), 1.5, 5], 1, 0.3 + i / 1000, 0)
+            for i in range(300)
+        )
     )
     found = Segmenter(yolo(tmp_path / "y.onnx", many))(red(64, 96))
     assert len(found) == MOST
@@ -171,7 +184,19 @@ def _named(path, text):
 def test_predict_runs_a_foreign_file(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), red(128, 192)[..., ::-1])
     file = yolo(tmp_path / "y.onnx", columns(candidate([48, 32, 40, 40], 0, 0.9, 0)))
-    assert main(["predict", str(tmp_path / "a.png"), "--model", str(file), "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(
+            [
+                "predict",
+                str(tmp_path / "a.png"),
+                "--model",
+                str(file),
+                "--out",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 0
+    )
     assert (tmp_path / "out" / "a_overlay.jpg").is_file()
 
 
@@ -183,8 +208,13 @@ def test_an_image_to_image_graph_is_no_segmenter(tmp_path, shape):
         [helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)],
         [helper.make_tensor_value_info("y", TensorProto.FLOAT, shape)],
     )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), tmp_path / "i.onnx")
-    with pytest.raises(ContractError, match="neither cohdc export nor a known foreign exporter wrote it"):
+    onnx.save(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9),
+        tmp_path / "i.onnx",
+    )
+    with pytest.raises(
+        ContractError, match="neither cohdc export nor a known foreign exporter wrote it"
+    ):
         Segmenter(tmp_path / "i.onnx")
 
 

@@ -1,4 +1,6 @@
-"""The networks that come with the package: named, small, described by their cards, and they find people."""
+"""The networks that come with the package: named, small, described by their cards, and they find
+people.
+"""
 
 import json
 import re
@@ -44,9 +46,16 @@ def test_it_keeps_the_contract_and_is_small(name: str, canvas: tuple[int, int]) 
 @pytest.mark.parametrize(("name", "size"), [("person", "n"), ("person_s", "s")])
 def test_the_card_tells_the_stored_figures(name: str, size: str) -> None:
     card = model_path(name).with_suffix(".md").read_text(encoding="utf-8")
-    stored = json.loads((ROOT / "docs" / "results" / "person" / f"{size}.json").read_text(encoding="utf-8"))
+    stored = json.loads(
+        (ROOT / "docs" / "results" / "person" / f"{size}.json").read_text(encoding="utf-8")
+    )
     rows = dict(re.findall(r"^\| (.+?) \| ([\d.]+) \|", card, flags=re.MULTILINE))
-    names = {"mask AP50": "segm_AP50", "mask AP": "segm_AP", "Boundary AP": "boundary_AP", "box AP50": "box_AP50"}
+    names = {
+        "mask AP50": "segm_AP50",
+        "mask AP": "segm_AP",
+        "Boundary AP": "boundary_AP",
+        "box AP50": "box_AP50",
+    }
     told = {key: float(rows[name]) for name, key in names.items()}
     assert told == {key: pytest.approx(stored["int8"][key], abs=5e-4) for key in names.values()}
     for word in ("Licence", "COCO", "ImageNet", f"tools/experiments/person_model.py {size}"):
@@ -72,10 +81,29 @@ def test_predict_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("wall.png", np.full((120, 160, 3), 90, np.uint8))
     assert main(["predict", "wall.png", "--model", "person", "--out", "found"]) == 0
-    assert json.loads(Path("found/predictions.json").read_text())["categories"] == [{"id": 1, "name": "person"}]
+    assert json.loads(Path("found/predictions.json").read_text())["categories"] == [
+        {"id": 1, "name": "person"}
+    ]
 
 
-def test_a_name_that_is_none_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_is_none_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     cv2.imwrite(str(tmp_path / "wall.png"), np.full((120, 160, 3), 90, np.uint8))
-    assert main(["predict", str(tmp_path / "wall.png"), "--model", "dog", "--out", str(tmp_path / "found")]) == 1
-    assert capsys.readouterr().err == "cohdc predict: dog: no such file; shipped networks: person, person_s\n"
+    assert (
+        main(
+            [
+                "predict",
+                str(tmp_path / "wall.png"),
+                "--model",
+                "dog",
+                "--out",
+                str(tmp_path / "found"),
+            ]
+        )
+        == 1
+    )
+    assert (
+        capsys.readouterr().err
+        == "cohdc predict: dog: no such file; shipped networks: person, person_s\n"
+    )

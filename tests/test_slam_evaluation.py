@@ -1,4 +1,6 @@
-"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, and tells what it found."""
+"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, and tells what it
+found.
+"""
 
 import json
 import sys
@@ -25,7 +27,15 @@ def folder(tool: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def call(tool: ModuleType, folder: Path, *more: str) -> None:
-    words = ["--root", str(folder / "set"), "--out", str(folder / "out"), "--quick", "--sequences", "rolling_cart"]
+    words = [
+        "--root",
+        str(folder / "set"),
+        "--out",
+        str(folder / "out"),
+        "--quick",
+        "--sequences",
+        "rolling_cart",
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["slam_evaluation", *words, *more])
         tool.main()
@@ -42,7 +52,9 @@ def test_rows_and_table(folder: Path) -> None:
         ("rolling_cart", "movers", 0),
     ]
     for row in rows(folder)[:2]:
-        metrics = json.loads((folder / "out" / "rolling_cart" / f"{row['mode']}_seed0" / "metrics.json").read_text())
+        metrics = json.loads(
+            (folder / "out" / "rolling_cart" / f"{row['mode']}_seed0" / "metrics.json").read_text()
+        )
         assert row["ate_m"] == metrics["ate_m"]["rmse"]
         assert row["coverage"] == metrics["coverage"] == 1
         assert row["method"]["loops"] is True  # type: ignore[index]

@@ -1,4 +1,6 @@
-"""Trajectory files and scores: known answers, invariances, the stored walking estimates, agreement with evo."""
+"""Trajectory files and scores: known answers, invariances, the stored walking estimates, agreement
+with evo.
+"""
 
 import importlib.util
 import json
@@ -18,7 +20,14 @@ from cohdc_train.errors import DataError
 from cohdc_train.trajectory import metrics
 from cohdc_train.trajectory.association import associate, match
 from cohdc_train.trajectory.evaluate import coverage, evaluate, score
-from cohdc_train.trajectory.metrics import align_umeyama, all_pairs, ate, pairs_apart, rpe, statistics
+from cohdc_train.trajectory.metrics import (
+    align_umeyama,
+    all_pairs,
+    ate,
+    pairs_apart,
+    rpe,
+    statistics,
+)
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
 
 TUM = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum"
@@ -43,8 +52,12 @@ def rigid(rng: np.random.Generator) -> NDArray[np.float64]:
     return T
 
 
-def wander(rng: np.random.Generator, n: int = 40, rate: float = 10.0, noise: float = 0.0) -> Trajectory:
-    """A smooth walk of the camera; with `noise` every pose is disturbed by that many metres and radians."""
+def wander(
+    rng: np.random.Generator, n: int = 40, rate: float = 10.0, noise: float = 0.0
+) -> Trajectory:
+    """A smooth walk of the camera; with `noise` every pose is disturbed by that many metres and
+    radians.
+    """
     time = np.arange(n) / rate
     phases = np.arange(3)
     poses = np.tile(np.eye(4), (n, 1, 1))
@@ -71,7 +84,9 @@ def test_comments_blank_lines_and_commas_are_read(tmp_path: Path) -> None:
     file.write_text("# a comment\n\n1.0, 1, 2, 3, 0, 0, 0, 2\n  # another\n2.5 4 5 6 0 0 1 0\n")
     trajectory = read_tum(file)
     assert trajectory.stamps.tolist() == [1.0, 2.5]
-    assert np.array_equal(trajectory.poses[0], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    assert np.array_equal(
+        trajectory.poses[0], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    )
     assert np.allclose(trajectory.poses[1, :3, :3], np.diag([-1, -1, 1]))
 
 
@@ -86,7 +101,9 @@ def test_comments_blank_lines_and_commas_are_read(tmp_path: Path) -> None:
         ("# nothing\n", ":", "no pose"),
     ],
 )
-def test_bad_file_is_refused_with_its_line(tmp_path: Path, text: str, place: str, fault: str) -> None:
+def test_bad_file_is_refused_with_its_line(
+    tmp_path: Path, text: str, place: str, fault: str
+) -> None:
     file = tmp_path / "bad.txt"
     file.write_text(text)
     with pytest.raises(DataError) as error:
@@ -101,7 +118,9 @@ def test_missing_file_is_refused(tmp_path: Path) -> None:
         read_tum(tmp_path / "absent.txt")
 
 
-def test_repeated_stamps_are_kept_and_said_aloud(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_repeated_stamps_are_kept_and_said_aloud(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     file = tmp_path / "t.txt"
     file.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     assert len(read_tum(file)) == 3
@@ -139,7 +158,9 @@ def test_association_is_one_to_one_near_and_increasing(seed: int) -> None:
     assert (np.diff(pairs, axis=0) > 0).all()
     assert (np.abs(a[pairs[:, 0]] - b[pairs[:, 1]]) <= 0.03 + 1e-12).all()
     free_a, free_b = np.delete(a, pairs[:, 0]), np.delete(b, pairs[:, 1])
-    assert not (np.abs(free_a[:, None] - free_b) <= 0.03 - 1e-12).any(), "a pair that could be made was not"
+    assert not (np.abs(free_a[:, None] - free_b) <= 0.03 - 1e-12).any(), (
+        "a pair that could be made was not"
+    )
 
 
 def test_repeated_row_is_matched_as_its_stamp() -> None:
@@ -163,7 +184,14 @@ def test_too_few_matches_are_refused() -> None:
 def test_statistics_of_a_known_list() -> None:
     got = statistics(np.array([1.0, 2.0, 3.0, 6.0]))
     assert got == pytest.approx(
-        {"rmse": np.sqrt(12.5), "mean": 3.0, "median": 2.5, "std": np.sqrt(3.5), "min": 1.0, "max": 6.0}
+        {
+            "rmse": np.sqrt(12.5),
+            "mean": 3.0,
+            "median": 2.5,
+            "std": np.sqrt(3.5),
+            "min": 1.0,
+            "max": 6.0,
+        }
     )
 
 
@@ -171,7 +199,9 @@ def test_known_ate() -> None:
     corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], float)
     poses, larger = (np.tile(np.eye(4), (4, 1, 1)) for _ in range(2))
     poses[:, :3, 3] = corners
-    larger[:, :3, 3] = 1.1 * corners  # scale is not aligned away: every corner is off by a tenth of its radius
+    larger[:, :3, 3] = (
+        1.1 * corners
+    )  # scale is not aligned away: every corner is off by a tenth of its radius
     errors = ate(Trajectory(np.arange(4.0), poses), Trajectory(np.arange(4.0), larger))
     assert errors == pytest.approx(np.full(4, 0.1 * np.sqrt(2)))
 
@@ -181,7 +211,9 @@ def test_known_drift_is_the_rpe() -> None:
     still, drifting = (np.tile(np.eye(4), (50, 1, 1)) for _ in range(2))
     still[:, 0, 3] = stamps
     drifting[:, 0, 3] = 1.03 * stamps  # 3 cm a second along the way
-    drifting[:, :3, :3] = Rotation.from_euler("x", 2.0 * stamps[:, None], degrees=True).as_matrix()  # 2 deg a second
+    drifting[:, :3, :3] = Rotation.from_euler(
+        "x", 2.0 * stamps[:, None], degrees=True
+    ).as_matrix()  # 2 deg a second
     scores = score(Trajectory(stamps, still), Trajectory(stamps, drifting))
     assert scores["rpe_1s_m"]["rmse"] == pytest.approx(0.03)
     assert scores["rpe_1s_m"]["std"] == pytest.approx(0, abs=1e-9)
@@ -198,7 +230,9 @@ def test_all_pairs_are_those_of_tums_tool() -> None:
             step = np.linalg.inv(estimate.poses[i]) @ estimate.poses[j]
             lengths.append(np.linalg.norm((np.linalg.inv(true_step) @ step)[:3, 3]))
     assert score(truth, estimate)["rpe_all_pairs_m"] == pytest.approx(statistics(np.array(lengths)))
-    assert min(lengths) == pytest.approx(0), "a pose paired with itself is why that tool prints a minimum of 0"
+    assert min(lengths) == pytest.approx(0), (
+        "a pose paired with itself is why that tool prints a minimum of 0"
+    )
 
 
 def test_long_runs_are_sampled_with_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,7 +245,9 @@ def test_long_runs_are_sampled_with_a_seed(monkeypatch: pytest.MonkeyPatch) -> N
     assert np.array_equal(pairs, all_pairs(n))
     assert not np.array_equal(pairs, all_pairs(n, seed=1))
     every = np.stack(np.divmod(np.arange(n * n), n), axis=1)
-    assert rpe(truth, estimate, pairs)[0].mean() == pytest.approx(rpe(truth, estimate, every)[0].mean(), rel=2e-2)
+    assert rpe(truth, estimate, pairs)[0].mean() == pytest.approx(
+        rpe(truth, estimate, every)[0].mean(), rel=2e-2
+    )
 
 
 def test_pairs_keep_to_one_second() -> None:
@@ -274,22 +310,38 @@ def test_coverage_counts_the_lost_time() -> None:
     truth = wander(np.random.default_rng(9), n=100, rate=100.0)
     assert coverage(truth, truth.take(np.arange(0, 100, 4))) == 1.0
     lost = truth.take(np.r_[0:20, 60:100])
-    assert coverage(truth, lost) == pytest.approx((100 - 40 + 5 + 5) / 100, abs=0.011)  # 0.05 s on either side count
+    assert coverage(truth, lost) == pytest.approx(
+        (100 - 40 + 5 + 5) / 100, abs=0.011
+    )  # 0.05 s on either side count
 
 
 # ---- the verb
 
 
-def test_evaluate_prints_and_writes_the_same_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_prints_and_writes_the_same_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rng = np.random.default_rng(10)
     truth, estimate = wander(rng), wander(rng, noise=0.02)
     write_tum(tmp_path / "truth.txt", truth)
     write_tum(tmp_path / "estimate.txt", estimate)
-    result = evaluate(tmp_path / "truth.txt", tmp_path / "estimate.txt", out=tmp_path / "new" / "scores.json")
+    result = evaluate(
+        tmp_path / "truth.txt", tmp_path / "estimate.txt", out=tmp_path / "new" / "scores.json"
+    )
     stored = json.loads((tmp_path / "new" / "scores.json").read_text())
     assert stored == result
-    assert set(stored) == {"ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m", "coverage", "pairs"}
-    assert all(set(stored[key]) == {"rmse", "mean", "median", "std", "min", "max"} for key in list(stored)[:4])
+    assert set(stored) == {
+        "ate_m",
+        "rpe_1s_m",
+        "rpe_1s_deg",
+        "rpe_all_pairs_m",
+        "coverage",
+        "pairs",
+    }
+    assert all(
+        set(stored[key]) == {"rmse", "mean", "median", "std", "min", "max"}
+        for key in list(stored)[:4]
+    )
     assert stored["pairs"] == 40
     printed = capsys.readouterr().out
     assert f"{stored['ate_m']['rmse']:.4f}" in printed
@@ -336,7 +388,9 @@ for truth, estimate in zip(sys.argv[2::2], sys.argv[3::2]):
     result.append(row)
 print(json.dumps(result))
 """
-needs_evo = pytest.mark.skipif(importlib.util.find_spec("evo") is None, reason="evo is not installed")
+needs_evo = pytest.mark.skipif(
+    importlib.util.find_spec("evo") is None, reason="evo is not installed"
+)
 
 
 def evo_says(home: Path, delta: int, files: list[Path]) -> list[dict[str, dict[str, float]]]:
@@ -358,7 +412,9 @@ def test_evo_agrees_on_drawn_trajectories(tmp_path: Path) -> None:
     (evo,) = evo_says(tmp_path, 10, files)  # 10 frames of 0.1 s are the second
     ours = score(*map(read_tum, files))
     for ours_key, evo_key in [("ate_m", "ate_m"), ("rpe_1s_m", "rpe_m"), ("rpe_1s_deg", "rpe_deg")]:
-        assert ours[ours_key] == pytest.approx({name: evo[evo_key][name] for name in ours[ours_key]}, abs=1e-6)
+        assert ours[ours_key] == pytest.approx(
+            {name: evo[evo_key][name] for name in ours[ours_key]}, abs=1e-6
+        )
 
 
 @needs_evo
@@ -366,7 +422,10 @@ def test_evo_agrees_on_drawn_trajectories(tmp_path: Path) -> None:
 def test_evo_agrees_on_the_stored_walking_estimates(tmp_path: Path) -> None:
     files = []
     for name in WALKING:
-        files += [TUM / "groundtruth" / f"fr3_{name[:-2]}.txt", TUM / "trajectories" / f"{name}.txt"]
+        files += [
+            TUM / "groundtruth" / f"fr3_{name[:-2]}.txt",
+            TUM / "trajectories" / f"{name}.txt",
+        ]
     for (truth, estimate), evo in zip(
         zip(files[::2], files[1::2], strict=True), evo_says(tmp_path, 30, files), strict=True
     ):
@@ -376,4 +435,6 @@ def test_evo_agrees_on_the_stored_walking_estimates(tmp_path: Path) -> None:
         ours = {"ate_m": ate(*matched), "rpe_m": metres, "rpe_deg": degrees}
         for key, errors in ours.items():
             six = statistics(errors)
-            assert six == pytest.approx({name: evo[key][name] for name in six}, abs=1e-6), f"{estimate.name} {key}"
+            assert six == pytest.approx({name: evo[key][name] for name in six}, abs=1e-6), (
+                f"{estimate.name} {key}"
+            )

@@ -1,4 +1,6 @@
-"""tools/tum_benchmark: finds the sequences below a folder, linked ones too, runs each once, writes rows and tables."""
+"""tools/tum_benchmark: finds the sequences below a folder, linked ones too, runs each once, writes
+rows and tables.
+"""
 
 import json
 import subprocess
@@ -27,7 +29,17 @@ def call(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_linked_sequence_is_run_once_for_each_mode(root: Path, tmp_path: Path) -> None:
-    words = ("--root", str(root), "--out", str(tmp_path / "out"), "--modes", "none", "masks", "--seeds", "0")
+    words = (
+        "--root",
+        str(root),
+        "--out",
+        str(tmp_path / "out"),
+        "--modes",
+        "none",
+        "masks",
+        "--seeds",
+        "0",
+    )
     done = call(*words)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "out" / "benchmark.json").read_text())
@@ -49,7 +61,9 @@ def test_a_linked_sequence_is_run_once_for_each_mode(root: Path, tmp_path: Path)
 def test_published_figures_stand_beside_tums_own_sequence(root: Path, tmp_path: Path) -> None:
     (root / "linked").unlink()
     (root / "rgbd_dataset_freiburg3_walking_xyz").symlink_to(tmp_path / "elsewhere" / "walking_xyz")
-    done = call("--root", str(root), "--out", str(tmp_path / "out"), "--modes", "none", "--seeds", "0")
+    done = call(
+        "--root", str(root), "--out", str(tmp_path / "out"), "--modes", "none", "--seeds", "0"
+    )
     assert done.returncode == 0, done.stderr
     table = (tmp_path / "out" / "benchmark.md").read_text()
     assert "| none, median (worst) | paper |" in table

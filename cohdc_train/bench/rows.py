@@ -25,7 +25,12 @@ ROWS = {  # the paper's, as shipped configurations
     "ResNet101": "networks/resnet101.yaml",
     "MobileNetV1": "networks/mobilenet_v1.yaml",
 }
-SCORES = {"ap": "segm_AP", "boundary_ap": "boundary_AP", "s90_matched": "S90_matched", "s90_all": "S90_all"}
+SCORES = {
+    "ap": "segm_AP",
+    "boundary_ap": "boundary_AP",
+    "s90_matched": "S90_matched",
+    "s90_all": "S90_all",
+}
 _IOU_FLOOR = 0.95  # of the polygons whose vertices are counted
 
 
@@ -39,7 +44,8 @@ class Entry:
         checkpoint: None of an ONNX file.
         files: "fps_ort" -> its ONNX file, "fps_ort_int8" -> the quantised one where there is one.
         train_seconds: None of a finished model.
-        scores: ap, boundary_ap, s90_matched, s90_all, vertices, and ap_int8 where there is an int8 file.
+        scores: ap, boundary_ap, s90_matched, s90_all, vertices, and ap_int8 where there is an int8
+            file.
     """
 
     name: str
@@ -75,7 +81,9 @@ def row_config(row: str) -> Path:
     try:
         return config_path(ROWS.get(row, row))
     except CohdcError as error:
-        raise CohdcError(f"no row {row!r}; there are {', '.join(ROWS)}, and YAML files of networks") from error
+        raise CohdcError(
+            f"no row {row!r}; there are {', '.join(ROWS)}, and YAML files of networks"
+        ) from error
 
 
 def finished_entry(model: Path, data: Path, out: Path, threads: int, int8: bool) -> Entry:
@@ -83,16 +91,31 @@ def finished_entry(model: Path, data: Path, out: Path, threads: int, int8: bool)
     model = model_path(model)
     if not model.is_file():
         raise CohdcError(f"{model}: no such file")
-    folder = out / f"model_{model.stem}_{sha256(model)[:8]}"  # most checkpoints are called best.ckpt
+    folder = (
+        out / f"model_{model.stem}_{sha256(model)[:8]}"
+    )  # most checkpoints are called best.ckpt
     if model.suffix == ".onnx":
         folder.mkdir(parents=True, exist_ok=True)
         files = {"fps_ort": model}
-        return Entry(model.name, None, None, files, None, _scores(files, data, folder / "scores.json", threads))
+        return Entry(
+            model.name,
+            None,
+            None,
+            files,
+            None,
+            _scores(files, data, folder / "scores.json", threads),
+        )
     return _exported(model.name, None, Trained(model, 0.0), data, folder, threads, int8)
 
 
 def _exported(
-    name: str, seed: int | None, trained: Trained, data: Path, folder: Path, threads: int, int8: bool
+    name: str,
+    seed: int | None,
+    trained: Trained,
+    data: Path,
+    folder: Path,
+    threads: int,
+    int8: bool,
 ) -> Entry:
     file = folder / "model.onnx"
     small = file.with_name("model.int8.onnx")
@@ -100,7 +123,9 @@ def _exported(
     there = all(path.is_file() for path in (kept, file, *([small] if int8 else [])))
     if not (there and json.loads(kept.read_text()) == {"checkpoint": digest, "int8": int8}):
         images = CocoDataModule(data).folder.train[0].images[0].path.parent
-        export(trained.checkpoint, file, images=images, int8=images if int8 else None, allow_drop=True)
+        export(
+            trained.checkpoint, file, images=images, int8=images if int8 else None, allow_drop=True
+        )
         write_json(kept, {"checkpoint": digest, "int8": int8})
     files = {"fps_ort": file} | ({"fps_ort_int8": small} if int8 else {})
     seconds = None if seed is None else trained.seconds
@@ -120,13 +145,21 @@ def _scores(files: Mapping[str, Path], data: Path, kept: Path, threads: int) -> 
     scores = {column: results.scores[score] for column, score in SCORES.items()}
     scores["vertices"] = mean_vertices(results)
     if "fps_ort_int8" in files:
-        scores["ap_int8"] = score_file(files["fps_ort_int8"], data, threads=threads).scores["segm_AP"]
+        scores["ap_int8"] = score_file(files["fps_ort_int8"], data, threads=threads).scores[
+            "segm_AP"
+        ]
     write_json(kept, {"made_from": made_from, "scores": scores})
     return scores
 
 
 def mean_vertices(results: Results) -> float:
-    """Vertices of a likely detection's outline behind BAS-DP at an IoU of .95; nan without a detection."""
-    masks = [rle.decode(row["segmentation"]).astype(np.bool_) for row in results.rows if row["score"] >= LIKELY]
+    """Vertices of a likely detection's outline behind BAS-DP at an IoU of .95; nan without a
+    detection.
+    """
+    masks = [
+        rle.decode(row["segmentation"]).astype(np.bool_)
+        for row in results.rows
+        if row["score"] >= LIKELY
+    ]
     counts = [vertices(simplify(trace(mask), _IOU_FLOOR, "bas_dp")) for mask in masks if mask.any()]
     return float(np.mean(counts)) if counts else float("nan")

@@ -1,4 +1,6 @@
-"""How fast networks are from image to masks, in turn on the same pictures, and how much memory they take."""
+"""How fast networks are from image to masks, in turn on the same pictures, and how much memory they
+take.
+"""
 
 import statistics
 import subprocess
@@ -62,7 +64,9 @@ def torch_runner(checkpoint: Path) -> Runner:
 
 
 def frame_rates(runners: Mapping[K, Runner], pictures: Sequence[Image]) -> dict[K, Rate]:
-    """Frames per second of each runner, in turn, from uint8 [H, W, 3] to the masks of its likely detections."""
+    """Frames per second of each runner, in turn, from uint8 [H, W, 3] to the masks of its likely
+    detections.
+    """
     whole = {name: _to_masks(run) for name, run in runners.items()}
     return {name: _rate(taken) for name, taken in seconds_in_turn(whole, pictures).items()}
 
@@ -81,7 +85,8 @@ def _rate(seconds: Sequence[float]) -> Rate:
 
 
 def peak_memory(file: Path, picture: Path, threads: int) -> float:
-    """MiB that a process of its own takes at most, onnxruntime and numpy included, when it runs a file on a picture.
+    """MiB that a process of its own takes at most, onnxruntime and numpy included, when it runs a
+    file on a picture.
 
     picture: a .npy file of uint8 [H, W, 3]. Raises CohdcError when the process fails.
     """
@@ -97,8 +102,12 @@ def spread(values: Sequence[float]) -> tuple[float, float, float]:
     return statistics.median(values), min(values), max(values)
 
 
-def runners_of(checkpoint: Path | None, files: Mapping[str, Path], threads: int) -> dict[str, Runner]:
-    """`fps_torch` of a checkpoint and one runner of each file, by the names of table4.json's columns."""
+def runners_of(
+    checkpoint: Path | None, files: Mapping[str, Path], threads: int
+) -> dict[str, Runner]:
+    """`fps_torch` of a checkpoint and one runner of each file, by the names of table4.json's
+    columns.
+    """
     torch.set_num_threads(threads)
     found: dict[str, Runner] = {} if checkpoint is None else {"fps_torch": torch_runner(checkpoint)}
     return found | {name: Segmenter(path, threads) for name, path in files.items()}

@@ -78,7 +78,12 @@ def run(
     rates = _timed({name: of_row[0] for name, of_row in entries.items()}, pictures, threads)
     np.save(out / "picture.npy", pictures[0])
     table = [
-        _row(name, of_row, rates[name], peak_memory(of_row[0].files["fps_ort"], out / "picture.npy", threads))
+        _row(
+            name,
+            of_row,
+            rates[name],
+            peak_memory(of_row[0].files["fps_ort"], out / "picture.npy", threads),
+        )
         for name, of_row in entries.items()
     ]
     (out / "picture.npy").unlink()
@@ -91,7 +96,9 @@ def _pictures(data: Path, count: int) -> list[Any]:
     return [read_image(image) for image in split.images[:count]]
 
 
-def _timed(entries: dict[str, Entry], pictures: Sequence[Any], threads: int) -> dict[str, dict[str, Rate]]:
+def _timed(
+    entries: dict[str, Entry], pictures: Sequence[Any], threads: int
+) -> dict[str, dict[str, Rate]]:
     """Rates of every row by column; all of them take turns."""
     runners = {
         (name, column): runner
@@ -105,7 +112,9 @@ def _timed(entries: dict[str, Entry], pictures: Sequence[Any], threads: int) -> 
 
 
 def _row(name: str, entries: Sequence[Entry], rates: dict[str, Rate], peak: float) -> Row:
-    """A row of table4.json: medians over seeds, and beside them the range; None where there is nothing."""
+    """A row of table4.json: medians over seeds, and beside them the range; None where there is
+    nothing.
+    """
     row: Row = {"name": name}
     first = entries[0]
     seconds = [entry.train_seconds for entry in entries if entry.train_seconds is not None]
@@ -117,7 +126,9 @@ def _row(name: str, entries: Sequence[Entry], rates: dict[str, Rate], peak: floa
     scores = {key: [entry.scores[key] for entry in entries] for key in first.scores}
     row |= {key: _none_if_nan(spread(values)[0]) for key, values in scores.items()}
     row |= {"ap_int8": row.get("ap_int8"), "peak_mb": peak}
-    row["ranges"] = {key: [_none_if_nan(v) for v in spread(values)[1:]] for key, values in scores.items()}
+    row["ranges"] = {
+        key: [_none_if_nan(v) for v in spread(values)[1:]] for key, values in scores.items()
+    }
     row["ranges"] |= {column: [rate.low, rate.high] for column, rate in rates.items()}
     row["seeds"] = [entry.seed for entry in entries if entry.seed is not None]
     return row
@@ -129,7 +140,9 @@ def _none_if_nan(value: float) -> float | None:
 
 def environment(threads: int, data: Path, pictures: int, seeds: Sequence[int]) -> str:
     """One paragraph: what the figures were measured on."""
-    packages = ", ".join(f"{name} {metadata.version(name)}" for name in ("torch", "torchvision", "onnxruntime"))
+    packages = ", ".join(
+        f"{name} {metadata.version(name)}" for name in ("torch", "torchvision", "onnxruntime")
+    )
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -143,7 +156,9 @@ def environment(threads: int, data: Path, pictures: int, seeds: Sequence[int]) -
 
 
 def as_text(table: Sequence[Row], environment: str) -> str:
-    """The table in Markdown, with ranges over seeds (scores) and quartiles over pictures (FPS) in brackets."""
+    """The table in Markdown, with ranges over seeds (scores) and quartiles over pictures (FPS) in
+    brackets.
+    """
     lines = [list(_COLUMNS.values()), ["---"] * len(_COLUMNS)]
     for row in table:
         lines.append([_cell(row, column) for column in _COLUMNS])
@@ -157,11 +172,15 @@ def _cell(row: Row, column: str) -> str:
         return "-"
     if isinstance(value, str):
         return value
-    digits = 1 if column in ("train_seconds", "model_mb", "model_mb_int8", "peak_mb", "vertices") else 3
+    digits = (
+        1 if column in ("train_seconds", "model_mb", "model_mb_int8", "peak_mb", "vertices") else 3
+    )
     digits = 2 if column in _RATES else digits
     low, high = row["ranges"].get(column, (None, None))
     one = low is None or high is None or (column not in _RATES and len(row["seeds"]) < 2)
-    return f"{value:.{digits}f}" if one else f"{value:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
+    return (
+        f"{value:.{digits}f}" if one else f"{value:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
+    )
 
 
 def _write(out: Path, table: Sequence[Row], said: str) -> None:
@@ -178,7 +197,9 @@ def _write(out: Path, table: Sequence[Row], said: str) -> None:
 
 
 def plot(table: Sequence[Row]) -> bytes:
-    """Mask AP over frames per second as a PNG, with their ranges; float32 and int8 of a network are joined."""
+    """Mask AP over frames per second as a PNG, with their ranges; float32 and int8 of a network are
+    joined.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -188,10 +209,14 @@ def plot(table: Sequence[Row]) -> bytes:
         pairs = (("fps_ort", "ap", "o"), ("fps_ort_int8", "ap_int8", "s"))
         points = [(x, y, m) for x, y, m in pairs if row[x] is not None and row[y] is not None]
         color = f"C{i % 10}"
-        axes.plot([row[x] for x, _, _ in points], [row[y] for _, y, _ in points], color=color, linewidth=1)
+        axes.plot(
+            [row[x] for x, _, _ in points], [row[y] for _, y, _ in points], color=color, linewidth=1
+        )
         for x, y, marker in points:
             errors = _either_way(row, y), _either_way(row, x)
-            axes.errorbar(row[x], row[y], *errors, fmt=marker, color=color, elinewidth=0.7, capsize=2)
+            axes.errorbar(
+                row[x], row[y], *errors, fmt=marker, color=color, elinewidth=0.7, capsize=2
+            )
         if points:
             place = row[points[0][0]], row[points[0][1]]
             axes.annotate(row["name"], place, xytext=(5, 5), textcoords="offset points", fontsize=8)
@@ -208,6 +233,8 @@ def plot(table: Sequence[Row]) -> bytes:
 
 
 def _either_way(row: Row, name: str) -> list[list[float]]:
-    """[[below], [above]] of a column's median in a row: how far its range reaches, 0 where it has none."""
+    """[[below], [above]] of a column's median in a row: how far its range reaches, 0 where it has
+    none.
+    """
     low, high = (row[name] if end is None else end for end in row["ranges"].get(name, (None, None)))
     return [[row[name] - low], [high - row[name]]]

@@ -15,7 +15,9 @@ from cohdc_train.presets import config_path
 
 
 class Trained(NamedTuple):
-    """checkpoint: last.ckpt. seconds: wall clock of `cohdc fit`, with its start and without validation."""
+    """checkpoint: last.ckpt. seconds: wall clock of `cohdc fit`, with its start and without
+    validation.
+    """
 
     checkpoint: Path
     seconds: float
@@ -24,13 +26,21 @@ class Trained(NamedTuple):
 def train(folder: Path, data: Sequence[Path], options: Sequence[str], threads: int = 1) -> Trained:
     """`cohdc fit` into a folder, unless it holds a training with the same data and options.
 
-    data: COCO-format folders, the first one validated. Raises CohdcError naming the log when it fails.
+    data: COCO-format folders, the first one validated. Raises CohdcError naming the log when it
+    fails.
     """
     kept, checkpoint = folder / "training.json", folder / "last.ckpt"
     configs = {
-        option: sha256(config_path(option.partition("=")[2])) for option in options if option.startswith("--config=")
+        option: sha256(config_path(option.partition("=")[2]))
+        for option in options
+        if option.startswith("--config=")
     }
-    asked = {"data": [str(root) for root in data], "options": list(options), "configs": configs, "threads": threads}
+    asked = {
+        "data": [str(root) for root in data],
+        "options": list(options),
+        "configs": configs,
+        "threads": threads,
+    }
     if kept.is_file() and checkpoint.is_file():
         known = json.loads(kept.read_text())
         if known["asked"] == asked:
@@ -38,7 +48,12 @@ def train(folder: Path, data: Sequence[Path], options: Sequence[str], threads: i
     kept.unlink(missing_ok=True)
     start = time.monotonic()
     roots = f"[{','.join(str(root) for root in data)}]"
-    fixed = (f"--data.root={roots}", f"--out={folder}", "--data.workers=0", "--trainer.limit_val_batches=0")
+    fixed = (
+        f"--data.root={roots}",
+        f"--out={folder}",
+        "--data.workers=0",
+        "--trainer.limit_val_batches=0",
+    )
     quiet = ("--pictures=false", "--trainer.enable_progress_bar=false")
     call(folder / "log.txt", "fit", *fixed, *quiet, *options, threads=threads)
     seconds = time.monotonic() - start
@@ -47,7 +62,9 @@ def train(folder: Path, data: Sequence[Path], options: Sequence[str], threads: i
 
 
 def budget(epochs: int | None, minutes: float | None) -> tuple[str, ...]:
-    """Options of `cohdc fit` for a training of so many epochs, or of so many minutes where those are given."""
+    """Options of `cohdc fit` for a training of so many epochs, or of so many minutes where those
+    are given.
+    """
     if minutes is None:
         return (f"--trainer.max_epochs={epochs}",)
     seconds = round(60 * minutes)
@@ -69,4 +86,6 @@ def call(log: Path, verb: str, *arguments: str, threads: int = 1) -> None:
         print("+", *command, file=stream, flush=True)
         done = subprocess.run(command, env=environment, stdout=stream, stderr=stream, check=False)
     if done.returncode:
-        raise CohdcError(f"{log}: cohdc {verb} failed with {done.returncode}; its message stands there")
+        raise CohdcError(
+            f"{log}: cohdc {verb} failed with {done.returncode}; its message stands there"
+        )

@@ -1,11 +1,23 @@
-"""Masks as polygons: exact outlines with parts and holes, and outlines of few vertices that keep a floor of IoU.
+"""Masks as polygons: exact outlines with parts and holes, and outlines of few vertices that keep a
+floor of IoU.
 
-Points are (x, y) in px with the origin at the corner of the first pixel, as COCO has them: pixel (i, j) is the square
-from (j, i) to (j + 1, i + 1) and belongs to a polygon when its centre does (even-odd rule over all rings).
+Points are (x, y) in px with the origin at the corner of the first pixel, as COCO has them: pixel
+(i, j) is the square from (j, i) to (j + 1, i + 1) and belongs to a polygon when its centre does
+(even-odd rule over all rings).
 """
 
 from cohdc_train.contour.beetle_search import BeetleSearch
 from cohdc_train.contour.polygons import Polygon, joined, rasterize, trace, vertices
 from cohdc_train.contour.simplification import METHODS, Method, simplify
 
-__all__ = ["METHODS", "BeetleSearch", "Method", "Polygon", "joined", "rasterize", "simplify", "trace", "vertices"]
+__all__ = [
+    "METHODS",
+    "BeetleSearch",
+    "Method",
+    "Polygon",
+    "joined",
+    "rasterize",
+    "simplify",
+    "trace",
+    "vertices",
+]

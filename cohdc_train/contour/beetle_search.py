@@ -24,14 +24,15 @@ class BeetleSearch:
         S: step, the length of the first move behind a dropped vertex, px.
         H: attenuation of the step with every move.
         c: ratio of the step to the whiskers' length d_0 = S / c.
-        n: most moves behind a dropped vertex; when they do not lead back to the floor, the vertex stays.
+        n: most moves behind a dropped vertex; when they do not lead back to the floor, the vertex
+            stays.
         pairs: whiskers of a beetle, in pairs of opposite directions; the paper's has one.
-        tries: vertices that are tried before the search ends, those that are missed least first; more of an outline
-            with many.
+        tries: vertices that are tried before the search ends, those that are missed least first;
+            more of an outline with many.
         seed: of the random directions.
 
-    The paper's k, the number of parameters, is 2 for every beetle: a vertex. All of them together have twice the
-    vertices.
+    The paper's k, the number of parameters, is 2 for every beetle: a vertex. All of them together
+    have twice the vertices.
     """
 
     S: float = 3.0
@@ -48,13 +49,17 @@ class BeetleSearch:
         return [self.S * self.H**k for k in range(self.n)]
 
 
-def search_vertices(finer: list[Polygon], iou_floor: float, coverage: Coverage, search: BeetleSearch) -> list[Polygon]:
+def search_vertices(
+    finer: list[Polygon], iou_floor: float, coverage: Coverage, search: BeetleSearch
+) -> list[Polygon]:
     """Drop vertices and move the others while the floor is kept.
 
-    Of an outline with many vertices several go at a time, until that fails. When not one can be dropped, all move for a
-    higher IoU. Then there is another round, which ends the search when it drops nothing.
+    Of an outline with many vertices several go at a time, until that fails. When not one can be
+    dropped, all move for a higher IoU. Then there is another round, which ends the search when it
+    drops nothing.
 
-    finer: polygons that keep the floor. Returns the last ones that keep it and do not cross themselves.
+    finer: polygons that keep the floor. Returns the last ones that keep it and do not cross
+    themselves.
     """
     if vertices(finer) > _MOST_VERTICES:
         return finer
@@ -68,7 +73,9 @@ def search_vertices(finer: list[Polygon], iou_floor: float, coverage: Coverage, 
                 return fewer
         return None
 
-    while (count := beetles.count // _AT_A_TIME) > 1 and (fewer := without_one_of(beetles.missed_together(count))):
+    while (count := beetles.count // _AT_A_TIME) > 1 and (
+        fewer := without_one_of(beetles.missed_together(count))
+    ):
         beetles = fewer
     while True:
         tries = 1 if moved else max(search.tries, beetles.count // _DENSE)
@@ -84,15 +91,17 @@ def search_vertices(finer: list[Polygon], iou_floor: float, coverage: Coverage, 
 class _Beetles:
     """The vertices of all rings, each the head of a beetle.
 
-    A beetle's f is what its two edges add to the pixels that only one of outline and polygons has. Neighbours do not
-    move at the same time, so that the sum falls by what each of them gains.
+    A beetle's f is what its two edges add to the pixels that only one of outline and polygons has.
+    Neighbours do not move at the same time, so that the sum falls by what each of them gains.
     """
 
     def __init__(self, polygons: list[Polygon], coverage: Coverage, pairs: int) -> None:
         rings = [ring for polygon in polygons for ring in polygon.rings]
         self._coverage = coverage
         self._spread = np.arange(pairs)[:, None] * np.pi / pairs
-        self._owner = np.array([k for k, polygon in enumerate(polygons) for _ in polygon.rings])  # of every ring
+        self._owner = np.array(
+            [k for k, polygon in enumerate(polygons) for _ in polygon.rings]
+        )  # of every ring
         self._sizes = np.array([len(ring) for ring in rings])
         self._x = np.concatenate(rings)  # [V, 2]
         self._link()
@@ -117,7 +126,9 @@ class _Beetles:
         return self._x, self._x.take(self._after, axis=0)
 
     def _turns(self, first: int) -> list[IntArray]:
-        """Two sets without neighbours among them; of an odd ring one vertex is in none, another for every `first`."""
+        """Two sets without neighbours among them; of an odd ring one vertex is in none, another for
+        every `first`.
+        """
         place = (self._place + first) % self._size
         odd = place % 2 == 1
         return [np.flatnonzero(odd), np.flatnonzero(~odd & (place < self._size - 1))]
@@ -128,16 +139,20 @@ class _Beetles:
         start[0] = self._x.take(self._before.take(index), axis=0)
         start[1] = self._x.take(self._after.take(index), axis=0)
         end[:] = heads
-        added = self._coverage.difference(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(2, *heads.shape[:2])
+        added = self._coverage.difference(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(
+            2, *heads.shape[:2]
+        )
         f: IntArray = added[0] - added[1]
         return f
 
     def move(self, step: float, whisker: float, first: int, rng: np.random.Generator) -> None:
-        """One move of every beetle by equation 2; a head goes to the best of the places that were felt.
+        """One move of every beetle by equation 2; a head goes to the best of the places that were
+        felt.
 
-        step: length of the move, px; whisker: d_0, px; both are shorter where edges are short, so that rings cross
-        less often. first: where the first turn begins. The equation's second line has `step` where the right whisker
-        stands; both are d_0 long here. The paper's head walks on from a worse place too, this one stays.
+        step: length of the move, px; whisker: d_0, px; both are shorter where edges are short, so
+        that rings cross less often. first: where the first turn begins. The equation's second line
+        has `step` where the right whisker stands; both are d_0 long here. The paper's head walks on
+        from a worse place too, this one stays.
         """
         start, end = self._edges()
         along = np.hypot(*(end - start).T)
@@ -164,12 +179,16 @@ class _Beetles:
             self._x[index] = felt[best, every]
 
     def settle(self, iou_floor: float, search: BeetleSearch, rng: np.random.Generator) -> bool:
-        """Move until the floor is kept; False when it is not after n moves, or will not be as far as one can tell."""
+        """Move until the floor is kept; False when it is not after n moves, or will not be as far
+        as one can tell.
+        """
         ious = [self.iou_about()]
         for k, step in enumerate(search.steps):
             if ious[-1] >= iou_floor and self.iou() >= iou_floor:
                 return True
-            if k > 1 and 2 * ious[-1] - ious[-3] < iou_floor:  # moves to come are worth less than the last two
+            if (
+                k > 1 and 2 * ious[-1] - ious[-3] < iou_floor
+            ):  # moves to come are worth less than the last two
                 return False
             self.move(step, step / search.c, k, rng)
             ious.append(self.iou_about())
@@ -184,9 +203,11 @@ class _Beetles:
         return other
 
     def least_missed(self, most: int) -> list[tuple[IntArray, int]]:
-        """Vertices that may be dropped, and what that adds to the sum; first what is missed least for its number.
+        """Vertices that may be dropped, and what that adds to the sum; first what is missed least
+        for its number.
 
-        One by one, but for triangles: as a whole, if they are no outer ring with holes nor the last outer ring.
+        One by one, but for triangles: as a whole, if they are no outer ring with holes nor the last
+        outer ring.
         """
         start, end = self._edges()
         ends = np.cumsum(self._sizes)
@@ -196,7 +217,9 @@ class _Beetles:
         missed = (across - around - around[self._before]).astype(np.float64)
         for ring in np.flatnonzero(self._sizes == 3).tolist():
             first = ends[ring] - 3
-            missed[first : first + 3] = -around[first : first + 3].sum() / 3 if self._spare(ring) else np.inf
+            missed[first : first + 3] = (
+                -around[first : first + 3].sum() / 3 if self._spare(ring) else np.inf
+            )
             missed[first + 1 : first + 3] = np.inf
         order = np.argsort(missed, kind="stable")[:most]
         counts = np.where(self._size[order] == 3, 3, 1)
@@ -207,7 +230,9 @@ class _Beetles:
         ]
 
     def missed_together(self, count: int) -> list[tuple[IntArray, int]]:
-        """`count` vertices to drop at a time, least missed and no neighbours, and what that adds; none if too few."""
+        """`count` vertices to drop at a time, least missed and no neighbours, and what that adds;
+        none if too few.
+        """
         chosen: list[int] = []
         total, near = 0, set[int]()
         for (first, *_), added in self.least_missed(2 * count):
@@ -225,10 +250,14 @@ class _Beetles:
         owner = self._owner
         if ring and owner[ring - 1] == owner[ring]:
             return True
-        return owner[0] != owner[-1] and not (ring + 1 < len(owner) and owner[ring + 1] == owner[ring])
+        return owner[0] != owner[-1] and not (
+            ring + 1 < len(owner) and owner[ring + 1] == owner[ring]
+        )
 
     def without(self, dropped: IntArray, added: int) -> "_Beetles":
-        """All but some vertices, and all but rings that have none left. added: to the sum, as `least_missed` has it."""
+        """All but some vertices, and all but rings that have none left. added: to the sum, as
+        `least_missed` has it.
+        """
         fewer = copy(self)
         sizes = self._sizes - np.bincount(
             np.searchsorted(np.cumsum(self._sizes), dropped, "right"), minlength=len(self._sizes)
@@ -247,7 +276,9 @@ class _Beetles:
         return self._coverage.iou_of(*self._edges())
 
     def iou_about(self) -> float:
-        """The same from what f has added up to and the rings' areas, not their pixels: a fifth of the time."""
+        """The same from what f has added up to and the rings' areas, not their pixels: a fifth of
+        the time.
+        """
         start, end = self._edges()
         twice = float(np.vdot(start[:, 0], end[:, 1]) - np.vdot(start[:, 1], end[:, 0]))
         return self._coverage.iou_about(abs(twice) / 2, self._apart)

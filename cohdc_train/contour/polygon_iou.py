@@ -15,9 +15,11 @@ _PER_PX = 5  # places for a vertex along a px: one decimal in a file, and the gr
 class Coverage:
     """The outline that simpler ones are compared with, on the grid of its bounds.
 
-    Nothing is filled. A crossing with a column's centre line has a place, which counts rows down the columns one after
-    another. Between the first place and the second, the third and the fourth and so on in their order lie the pixels
-    inside: the even-odd rule. Places of two outlines together enclose the pixels that only one of them has.
+    Nothing is filled. A crossing with a column's centre line has a place, which counts rows down
+    the columns one after another. Between the first place and the second, the third and the fourth
+    and so on in their order lie the pixels
+    inside: the even-odd rule. Places of two outlines together enclose the pixels that only one of
+    them has.
     """
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
@@ -28,13 +30,19 @@ class Coverage:
         self._first_centre = self.low + CENTRE
         self._width, height = (self.high - self.low).astype(int).tolist()
         self._rows = height + 1  # places in a column
-        across = np.flatnonzero(start[:, 0] != end[:, 0])  # of a traced outline half the edges run along columns
-        self._places = np.sort(self._crossed(start.take(across, axis=0), end.take(across, axis=0))[0])
+        across = np.flatnonzero(
+            start[:, 0] != end[:, 0]
+        )  # of a traced outline half the edges run along columns
+        self._places = np.sort(
+            self._crossed(start.take(across, axis=0), end.take(across, axis=0))[0]
+        )
         self.area = _enclosed(self._places)
         self._sign = _turn(polygons[0].outer)
 
     def iou(self, polygons: Sequence[Polygon]) -> float:
-        """IoU, 0..1, of polygons that lie within the bounds, as they are filled by the even-odd rule."""
+        """IoU, 0..1, of polygons that lie within the bounds, as they are filled by the even-odd
+        rule.
+        """
         rings = [ring for polygon in polygons for ring in polygon.rings]
         return self.iou_of(*edges(rings)) if rings else 0.0
 
@@ -43,7 +51,9 @@ class Coverage:
         return self.iou_about(*self.counts(start, end))
 
     def counts(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
-        """Pixels that closed rings cover, and that only they or the outline have; edges [E, 2] -> [E, 2]."""
+        """Pixels that closed rings cover, and that only they or the outline have; edges [E, 2] ->
+        [E, 2].
+        """
         places = self._crossed(start, end)[0]
         both = np.concatenate((self._places, places))
         places.sort()
@@ -57,8 +67,8 @@ class Coverage:
     def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
         """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
 
-        Less a constant per column, which is the same for all ways from one point to another; of rings that do not
-        cross themselves and turn as they were traced.
+        Less a constant per column, which is the same for all ways from one point to another; of
+        rings that do not cross themselves and turn as they were traced.
         """
         places, first, run = self._crossed(start, end)
         alone = np.zeros(len(places) + 1, np.int32)
@@ -79,7 +89,9 @@ class Coverage:
         return signed
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
-        """Places where edges cross the columns, the first of every edge, and the columns it runs along."""
+        """Places where edges cross the columns, the first of every edge, and the columns it runs
+        along.
+        """
         places, row, first, run = crossings(start, end, self._first_centre)
         places *= self._rows
         places += row
@@ -87,7 +99,9 @@ class Coverage:
 
     def nearest(self, points: FloatArray) -> FloatArray:
         """Points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
-        placed: FloatArray = points * _PER_PX  # exact for what is traced, so that halves go the same way everywhere
+        placed: FloatArray = (
+            points * _PER_PX
+        )  # exact for what is traced, so that halves go the same way everywhere
         placed += 0.5
         np.floor(placed, out=placed)
         placed /= _PER_PX
@@ -97,9 +111,13 @@ class Coverage:
         return placed
 
     def valid(self, polygons: Sequence[Polygon]) -> bool:
-        """Whether no ring crosses another or itself, and all turn as the outline's do: holes against outer rings."""
+        """Whether no ring crosses another or itself, and all turn as the outline's do: holes
+        against outer rings.
+        """
         for polygon in polygons:
-            if _turn(polygon.outer) != self._sign or any(_turn(hole) != -self._sign for hole in polygon.holes):
+            if _turn(polygon.outer) != self._sign or any(
+                _turn(hole) != -self._sign for hole in polygon.holes
+            ):
                 return False
         return not crossing([ring for polygon in polygons for ring in polygon.rings])
 
@@ -141,7 +159,9 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
 
 
 def _parted(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> NDArray[np.bool_]:
-    """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different sides: [m, n]."""
+    """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different
+    sides: [m, n].
+    """
     start, along = edges[0, :, None], edges[1, :, None] - edges[0, :, None]
     sides = ((others[:, None] - start) * along.conj()).imag
     parted: NDArray[np.bool_] = sides[0] * sides[1] < 0

@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-CENTRE = np.array([0.5, 0.5 + 1e-7])  # px; an edge that near a pixel's centre goes through it, wherever the grid begins
+CENTRE = np.array(
+    [0.5, 0.5 + 1e-7]
+)  # px; an edge that near a pixel's centre goes through it, wherever the grid begins
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """One connected part of a mask. outer: [n, 2] px, n >= 3; holes: rings of the same kind inside it."""
+    """One connected part of a mask. outer: [n, 2] px, n >= 3; holes: rings of the same kind inside
+    it.
+    """
 
     outer: FloatArray
     holes: tuple[FloatArray, ...] = ()
@@ -26,12 +30,16 @@ class Polygon:
         return (self.outer, *self.holes)
 
     def keyhole(self) -> FloatArray:
-        """The part as one ring [n, 2], px: every hole is joined by a bridge of no width, for formats without holes."""
+        """The part as one ring [n, 2], px: every hole is joined by a bridge of no width, for
+        formats without holes.
+        """
         return _bridged(self.rings)
 
 
 def joined(polygons: Sequence[Polygon]) -> FloatArray:
-    """All parts as one ring [n, 2], px, joined by bridges of no width, for formats of one ring per object."""
+    """All parts as one ring [n, 2], px, joined by bridges of no width, for formats of one ring per
+    object.
+    """
     return _bridged([polygon.keyhole() for polygon in polygons])
 
 
@@ -47,17 +55,20 @@ def _bridged(rings: Sequence[FloatArray]) -> FloatArray:
 def trace(mask: NDArray[np.bool_]) -> list[Polygon]:
     """The outline of a mask [H, W] along the edges of its pixels, one polygon per 8-connected part.
 
-    Filling the polygons gives exactly the mask back (inner corners are cut by half a pixel, which reaches no pixel's
-    centre); an empty mask has none.
+    Filling the polygons gives exactly the mask back (inner corners are cut by half a pixel, which
+    reaches no pixel's centre); an empty mask has none.
     """
-    # a grid of the pixels' corners and centres: every pixel sets its 3 x 3 nodes, so the border runs along pixel edges
+    # a grid of the pixels' corners and centres: every pixel sets its 3 x 3 nodes, so the border
+    # runs along pixel edges
     nodes = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
     nodes[1::2, 1::2] = mask
     nodes = cv2.dilate(nodes, np.ones((3, 3), np.uint8))
     found, hierarchy = cv2.findContours(nodes, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     rings = [ring.reshape(-1, 2).astype(np.float64) / 2 for ring in found]
     parents = [] if hierarchy is None else hierarchy.reshape(-1, 4)[:, 3].tolist()
-    parts: dict[int, list[FloatArray]] = {k: [ring] for k, ring in enumerate(rings) if parents[k] < 0}
+    parts: dict[int, list[FloatArray]] = {
+        k: [ring] for k, ring in enumerate(rings) if parents[k] < 0
+    }
     for ring, parent in zip(rings, parents, strict=True):
         if parent >= 0:
             parts[parent].append(ring)
@@ -65,14 +76,18 @@ def trace(mask: NDArray[np.bool_]) -> list[Polygon]:
 
 
 def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Fill polygons by the even-odd rule at pixel centres. size: (height, width), px. Returns [height, width] bool."""
+    """Fill polygons by the even-odd rule at pixel centres. size: (height, width), px. Returns
+    [height, width] bool.
+    """
     if not polygons:
         return np.zeros(size, np.bool_)
     height, width = size
     start, end = edges([ring for polygon in polygons for ring in polygon.rings])
     met = crossings(start, end, CENTRE, width)
     place = met.row.clip(0, height) * width + met.column
-    hits = np.bincount(place.astype(np.int64), minlength=(height + 1) * width).reshape(height + 1, width)
+    hits = np.bincount(place.astype(np.int64), minlength=(height + 1) * width).reshape(
+        height + 1, width
+    )
     odd = np.bitwise_xor.accumulate(hits[:height].astype(np.uint8), axis=0) & 1
     return odd.view(np.bool_)
 
@@ -82,14 +97,17 @@ def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     if len(rings) == 1:
         (ring,) = rings
         return ring, np.concatenate((ring[1:], ring[:1]))
-    return np.concatenate(rings), np.concatenate([part for ring in rings for part in (ring[1:], ring[:1])])
+    return np.concatenate(rings), np.concatenate(
+        [part for ring in rings for part in (ring[1:], ring[:1])]
+    )
 
 
 class Crossings(NamedTuple):
     """Where E edges cross the centre lines of a grid's columns, N times, edge after edge.
 
     column, row: [N] whole numbers; the row is that of the first pixel centre below.
-    first: [E], the first crossing of every edge; run: [E], columns from its start to its end, with their sign.
+    first: [E], the first crossing of every edge; run: [E], columns from its start to its end, with
+    their sign.
     """
 
     column: FloatArray
@@ -98,11 +116,13 @@ class Crossings(NamedTuple):
     run: IntArray
 
 
-def crossings(start: FloatArray, end: FloatArray, origin: FloatArray, width: int | None = None) -> Crossings:
+def crossings(
+    start: FloatArray, end: FloatArray, origin: FloatArray, width: int | None = None
+) -> Crossings:
     """Crossings of edges [E, 2] -> [E, 2], px, with columns.
 
-    origin: [2] px, the CENTRE of the grid's first pixel. width: that the columns are limited to; without it no point
-    may lie beside the grid.
+    origin: [2] px, the CENTRE of the grid's first pixel. width: that the columns are limited to;
+    without it no point may lie beside the grid.
     """
     x, to_x = start[:, 0] - origin[0], end[:, 0] - origin[0]
     y = start[:, 1] - origin[1]

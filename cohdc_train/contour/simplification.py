@@ -1,4 +1,6 @@
-"""Outlines of few vertices: Douglas-Peucker, Visvalingam, bisection on a tolerance, and BAS-DP (paper 2.1.3)."""
+"""Outlines of few vertices: Douglas-Peucker, Visvalingam, bisection on a tolerance, and BAS-DP
+(paper 2.1.3).
+"""
 
 from collections.abc import Callable, Sequence
 from heapq import heapify, heappop, heappush
@@ -32,17 +34,19 @@ def simplify(
 ) -> list[Polygon]:
     """The same outline with fewer vertices.
 
-    `bisection` looks for the largest Douglas-Peucker tolerance that keeps the floor: the real-time path. `visvalingam`
-    does so with Visvalingam and Whyatt's triangles. `bas_dp` goes on from bisection: it drops vertices and moves the
-    rest by beetle antennae search (the paper's equation 2), and keeps the finer polygon when the floor cannot be
-    reached. `dp` is plain Douglas-Peucker with a fixed tolerance, which knows no floor.
+    `bisection` looks for the largest Douglas-Peucker tolerance that keeps the floor: the real-time
+    path. `visvalingam` does so with Visvalingam and Whyatt's triangles. `bas_dp` goes on from
+    bisection: it drops vertices and moves the rest by beetle antennae search (the paper's equation
+    2), and keeps the finer polygon when the floor cannot be reached. `dp` is plain Douglas-Peucker
+    with a fixed tolerance, which knows no floor.
 
-    But for `dp`, rings of a result do not cross themselves or each other; where a coarser one would, the finer one
-    stays. Small parts and holes vanish where the floor allows it.
+    But for `dp`, rings of a result do not cross themselves or each other; where a coarser one
+    would, the finer one stays. Small parts and holes vanish where the floor allows it.
 
     Args:
         polygons: as `trace` gives them.
-        iou_floor: least IoU, 0..1, of the result with the polygons given, both filled at pixel centres; not of `dp`.
+        iou_floor: least IoU, 0..1, of the result with the polygons given, both filled at pixel
+            centres; not of `dp`.
         method: one of METHODS.
         epsilon: the tolerance of `dp`, px.
         search: parameters of `bas_dp`.
@@ -57,15 +61,25 @@ def simplify(
     if method == "dp":
         return _each_ring(polygons, _douglas_peucker, epsilon)
     coverage = Coverage(polygons)
-    finer = _bisect(polygons, iou_floor, coverage, _visvalingam if method == "visvalingam" else _douglas_peucker)
+    finer = _bisect(
+        polygons, iou_floor, coverage, _visvalingam if method == "visvalingam" else _douglas_peucker
+    )
     if method != "bas_dp":
         return finer
     return search_vertices(finer, iou_floor, coverage, search or BeetleSearch())
 
 
-def _bisect(polygons: Sequence[Polygon], iou_floor: float, coverage: Coverage, reduce: Reduction) -> list[Polygon]:
-    """The result with the fewest vertices among tolerances that keep the floor; the outline itself if none does."""
-    length = sum(cv2.arcLength(ring.astype(np.float32), True) for polygon in polygons for ring in polygon.rings)
+def _bisect(
+    polygons: Sequence[Polygon], iou_floor: float, coverage: Coverage, reduce: Reduction
+) -> list[Polygon]:
+    """The result with the fewest vertices among tolerances that keep the floor; the outline itself
+    if none does.
+    """
+    length = sum(
+        cv2.arcLength(ring.astype(np.float32), True)
+        for polygon in polygons
+        for ring in polygon.rings
+    )
     coarsest = max(_COARSEST * hypot(*(coverage.high - coverage.low)), 2 * _FINEST)
     bracket = Bracket.of(_FINEST, coarsest, 1 - iou_floor, _LOST * length / coverage.area)
     kept: list[list[Polygon]] = []
@@ -102,7 +116,9 @@ def _douglas_peucker(ring: FloatArray, epsilon: float) -> FloatArray:
 
 
 def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
-    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px, smallest first."""
+    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px,
+    smallest first.
+    """
     area = epsilon**2
     x: list[float] = ring[:, 0].tolist()
     y: list[float] = ring[:, 1].tolist()

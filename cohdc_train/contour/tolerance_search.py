@@ -6,7 +6,10 @@ from math import log
 _NARROW = 0.06  # of a logarithm: the bracket is not made narrower
 _CLIP = 0.35  # the next tolerance keeps that share of the bracket to either end
 _FIRST_STEP = 0.06  # of a logarithm, as long as one end is not known
-_AIM, _ENOUGH = 0.04, 0.08  # logarithm of what may be lost over what is: aimed at, and good enough to end with
+_AIM, _ENOUGH = (
+    0.04,
+    0.08,
+)  # logarithm of what may be lost over what is: aimed at, and good enough to end with
 _LEAST_LOST = 1e-6
 
 
@@ -23,8 +26,9 @@ class _End:
 class Bracket:
     """Two tolerances, of which the finer keeps the floor and the coarser does not.
 
-    What is lost grows about as the tolerance, so that on logarithmic scales a line through what is known tells where
-    the floor is reached. `at` is the logarithm of the tolerance to try, which `add` moves on.
+    What is lost grows about as the tolerance, so that on logarithmic scales a line through what is
+    known tells where the floor is reached. `at` is the logarithm of the tolerance to try, which
+    `add` moves on.
     """
 
     low: _End
@@ -35,15 +39,22 @@ class Bracket:
 
     @classmethod
     def of(cls, finest: float, coarsest: float, allowed: float, rise: float) -> "Bracket":
-        """Between two tolerances, px. allowed: 1 - the floor; rise: what is lost per px of tolerance."""
+        """Between two tolerances, px. allowed: 1 - the floor; rise: what is lost per px of
+        tolerance.
+        """
         low, high, allowed = log(finest), log(coarsest), max(allowed, _LEAST_LOST)
-        return cls(_End(low), _End(high), allowed, min(max(log(allowed / rise), low + _NARROW), high - _NARROW))
+        return cls(
+            _End(low),
+            _End(high),
+            allowed,
+            min(max(log(allowed / rise), low + _NARROW), high - _NARROW),
+        )
 
     def add(self, lost: float, vertices: int, keeps: bool) -> bool:
         """What came out at `at`; whether another tolerance is worth a try.
 
-        It is not when the floor is all but reached, when the bracket is narrow, or when one vertex is all that its ends
-        differ by.
+        It is not when the floor is all but reached, when the bracket is narrow, or when one vertex
+        is all that its ends differ by.
         """
         here = _End(self.at, vertices, log(max(lost, _LEAST_LOST) / self.allowed))
         if keeps:

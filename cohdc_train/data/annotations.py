@@ -1,4 +1,6 @@
-"""One annotation and one image of a COCO-format file, checked (numpy, pycocotools, OpenCV; no torch)."""
+"""One annotation and one image of a COCO-format file, checked (numpy, pycocotools, OpenCV; no
+torch).
+"""
 
 import math
 import warnings
@@ -28,7 +30,8 @@ class CocoObject:
         label: 1..C.
         box: x, y, width, height in px, clipped to the image.
         area: px^2, as annotated.
-        segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE; empty for a crowd given by its box only.
+        segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE; empty for a crowd
+            given by its box only.
         crowd: a region of uncounted objects: ignored by losses and scores.
     """
 
@@ -45,7 +48,9 @@ class CocoObject:
             encoded = self.segmentation
         else:
             encoded = rle.merge(rle.frPyObjects(self.segmentation, height, width))
-        with warnings.catch_warnings():  # pycocotools 2.0.11 decodes under numpy 2 by a deprecated way
+        with (
+            warnings.catch_warnings()
+        ):  # pycocotools 2.0.11 decodes under numpy 2 by a deprecated way
             warnings.simplefilter("ignore", DeprecationWarning)
             decoded: NDArray[np.uint8] = rle.decode(encoded)
         return decoded
@@ -67,7 +72,8 @@ def read_image(image: CocoImage) -> NDArray[np.uint8]:
 
     It is upright, turned by its EXIF orientation, unless the annotated size is that of the stored
     pixels only.
-    Raises DataError naming file and id when it cannot be decoded or its size is not the annotated one.
+    Raises DataError naming file and id when it cannot be decoded or its size is not the annotated
+    one.
     """
     annotated = (image.width, image.height)
     pixels = read_rgb(image.path, annotated)
@@ -78,17 +84,25 @@ def read_image(image: CocoImage) -> NDArray[np.uint8]:
 
 
 def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
-    """Polygons that can be drawn, with at least three points each, or a compressed RLE; empty when there is none."""
+    """Polygons that can be drawn, with at least three points each, or a compressed RLE; empty when
+    there is none.
+    """
     given = row.get("segmentation") or []
     try:
         if not isinstance(given, dict | list):
             raise TypeError("segmentation")
         if isinstance(given, list):
-            parts = [list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0]
-            return [part for part in parts if all(abs(value) <= _FAR for value in part)]  # neither NaN nor infinite
+            parts = [
+                list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0
+            ]
+            return [
+                part for part in parts if all(abs(value) <= _FAR for value in part)
+            ]  # neither NaN nor infinite
         if list(given["size"]) != [image.height, image.width]:
             size = f"{image.height}x{image.width}"
-            raise DataError(f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}")
+            raise DataError(
+                f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}"
+            )
         if not fills(given["counts"], image.height * image.width):
             raise ValueError("RLE counts")
         if isinstance(given["counts"], list):
@@ -96,7 +110,10 @@ def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: annotation {row.get('id')}: neither polygons nor RLE") from error
     counts = given["counts"]
-    return {"size": list(given["size"]), "counts": counts.decode() if isinstance(counts, bytes) else counts}
+    return {
+        "size": list(given["size"]),
+        "counts": counts.decode() if isinstance(counts, bytes) else counts,
+    }
 
 
 def fills(counts: str | bytes | list[int], pixels: int) -> bool:
@@ -115,8 +132,9 @@ def fills(counts: str | bytes | list[int], pixels: int) -> bool:
 def _decompressed(text: str) -> list[int]:
     """The run lengths of COCO's compressed RLE.
 
-    Each is written in groups of 5 bits, lowest first, 32 marking that another group follows and the last group's
-    highest bit a negative number; from the fourth on, a number is the difference to the run before the last.
+    Each is written in groups of 5 bits, lowest first, 32 marking that another group follows and the
+    last group's highest bit a negative number; from the fourth on, a number is the difference to
+    the run before the last.
     """
     runs: list[int] = []
     value, shift = 0, 0
@@ -147,12 +165,16 @@ def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
     return "" if _has_extent(_clip(_extent(segmentation), image)) else "degenerate contour"
 
 
-def build_object(row: dict[str, Any], label: int, segmentation: Any, image: CocoImage) -> CocoObject:
+def build_object(
+    row: dict[str, Any], label: int, segmentation: Any, image: CocoImage
+) -> CocoObject:
     """The object of a sound annotation; a missing box is taken from the contour."""
     box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
     area, number = row.get("area"), row.get("id")
     area = float(area) if area and is_numbers([area], 1) else box[2] * box[3]
-    return CocoObject(number if isinstance(number, int) else 0, label, box, area, segmentation, is_crowd(row))
+    return CocoObject(
+        number if isinstance(number, int) else 0, label, box, area, segmentation, is_crowd(row)
+    )
 
 
 def is_crowd(row: dict[str, Any]) -> bool:
@@ -172,14 +194,19 @@ def _extent(segmentation: Any) -> tuple[float, float, float, float]:
 
 def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, float]:
     x0, y0 = max(float(box[0]), 0.0), max(float(box[1]), 0.0)
-    x1, y1 = min(float(box[0]) + float(box[2]), image.width), min(float(box[1]) + float(box[3]), image.height)
+    x1, y1 = (
+        min(float(box[0]) + float(box[2]), image.width),
+        min(float(box[1]) + float(box[3]), image.height),
+    )
     return x0, y0, x1 - x0, y1 - y0
 
 
 def is_numbers(values: Any, count: int) -> bool:
     """Whether the values are a list of `count` finite numbers."""
     listed = isinstance(values, list | tuple) and len(values) == count
-    return listed and all(isinstance(value, int | float) and math.isfinite(value) for value in values)
+    return listed and all(
+        isinstance(value, int | float) and math.isfinite(value) for value in values
+    )
 
 
 def _has_extent(box: Sequence[float]) -> bool:
@@ -188,7 +215,11 @@ def _has_extent(box: Sequence[float]) -> bool:
 
 def lost_parts(row: dict[str, Any], segmentation: Any) -> int:
     """How many polygons of an annotation `read_segmentation` left out beside those it kept."""
-    return len(row["segmentation"]) - len(segmentation) if isinstance(segmentation, list) and segmentation else 0
+    return (
+        len(row["segmentation"]) - len(segmentation)
+        if isinstance(segmentation, list) and segmentation
+        else 0
+    )
 
 
 def reaches_out(box: Sequence[float] | None, image: CocoImage) -> bool:

@@ -11,8 +11,8 @@ GRID_PX = 32  # stride of the coarsest level that RoIs are pooled from
 def choose_canvas(sizes: Sequence[tuple[int, int]], max_area: int = MAX_AREA_PX) -> tuple[int, int]:
     """Choose the canvas that training images are fitted into.
 
-    The median height by the median width of the images, scaled down where it exceeds `max_area`, each side rounded
-    to a multiple of GRID_PX.
+    The median height by the median width of the images, scaled down where it exceeds `max_area`,
+    each side rounded to a multiple of GRID_PX.
 
     Args:
         sizes: (height, width) of every training image, px.
@@ -24,5 +24,7 @@ def choose_canvas(sizes: Sequence[tuple[int, int]], max_area: int = MAX_AREA_PX)
     height = statistics.median(height for height, _ in sizes)
     width = statistics.median(width for _, width in sizes)
     scale = min(1.0, math.sqrt(max_area / (height * width)))
-    rows, columns = (max(GRID_PX, round(side * scale / GRID_PX) * GRID_PX) for side in (height, width))
+    rows, columns = (
+        max(GRID_PX, round(side * scale / GRID_PX) * GRID_PX) for side in (height, width)
+    )
     return rows, columns

@@ -1,6 +1,7 @@
 """COCO-format annotations -> checked objects with labels 1..C (no torch).
 
-Numbers of classes are read, never typed: category ids are remapped through `categories`, sorted by id, to 1..C.
+Numbers of classes are read, never typed: category ids are remapped through `categories`, sorted by
+id, to 1..C.
 """
 
 from collections import Counter
@@ -47,12 +48,16 @@ class CocoSplit:
     lost_parts: int = 0
 
     def relabelled(self, class_names: Sequence[str]) -> "CocoSplit":
-        """The same split under another order of the same names. Raises DataError when the names differ."""
+        """The same split under another order of the same names. Raises DataError when the names
+        differ.
+        """
         if tuple(class_names) == self.class_names:
             return self
         if set(class_names) != set(self.class_names):
             ours, theirs = ", ".join(self.class_names), ", ".join(class_names)
-            raise DataError(f"{self.annotations}: classes are {ours}; the training split's are {theirs}")
+            raise DataError(
+                f"{self.annotations}: classes are {ours}; the training split's are {theirs}"
+            )
         to = [class_names.index(name) + 1 for name in self.class_names]
         images = tuple(
             replace(image, objects=tuple(replace(o, label=to[o.label - 1]) for o in image.objects))
@@ -61,38 +66,60 @@ class CocoSplit:
         return replace(self, class_names=tuple(class_names), images=images)
 
     def subset(self, count: int | None) -> "CocoSplit":
-        """`count` images drawn at random, always the same ones; a larger subset holds the smaller. None keeps all.
+        """`count` images drawn at random, always the same ones; a larger subset holds the smaller.
+        None keeps all.
 
         Raises DataError when there are fewer.
         """
         if count is None:
             return self
         if not 0 < count <= len(self.images):
-            raise DataError(f"{self.annotations}: {count} {self.name} images asked for, {len(self.images)} there")
+            raise DataError(
+                f"{self.annotations}: {count} {self.name} images asked for, {len(self.images)} there"
+            )
         chosen = sorted(np.random.default_rng(0).permutation(len(self.images))[:count])
         return replace(self, images=tuple(self.images[i] for i in chosen))
 
     def with_objects(self) -> "CocoSplit":
         """Return the split without images that have no object."""
-        return replace(self, images=tuple(image for image in self.images if any(not o.crowd for o in image.objects)))
+        return replace(
+            self,
+            images=tuple(image for image in self.images if any(not o.crowd for o in image.objects)),
+        )
 
     def losses(self) -> str:
         """What reading left out or cut, counted, in one line; empty when nothing was."""
-        parts = [f"{number} annotations dropped ({reason})" for reason, number in sorted(self.dropped.items())]
+        parts = [
+            f"{number} annotations dropped ({reason})"
+            for reason, number in sorted(self.dropped.items())
+        ]
         parts += [f"{self.clipped} clipped to the image"] if self.clipped else []
-        parts += [f"{self.lost_parts} broken polygons left out of contours"] if self.lost_parts else []
+        parts += (
+            [f"{self.lost_parts} broken polygons left out of contours"] if self.lost_parts else []
+        )
         return f"{self.annotations}: {', '.join(parts)}" if parts else ""
 
     def ground_truth(self) -> dict[str, Any]:
-        """The split as a COCO dict of its kept objects, category ids 1..C: what the scores are measured against."""
+        """The split as a COCO dict of its kept objects, category ids 1..C: what the scores are
+        measured against.
+        """
         categories = [{"id": i + 1, "name": name} for i, name in enumerate(self.class_names)]
-        images = [{"id": image.id, "height": image.height, "width": image.width} for image in self.images]
+        images = [
+            {"id": image.id, "height": image.height, "width": image.width} for image in self.images
+        ]
         annotations: list[dict[str, Any]] = []
         for image in self.images:
             for o in image.objects:
-                row = {"id": len(annotations) + 1, "image_id": image.id, "category_id": o.label, "bbox": list(o.box)}
+                row = {
+                    "id": len(annotations) + 1,
+                    "image_id": image.id,
+                    "category_id": o.label,
+                    "bbox": list(o.box),
+                }
                 shape = o.segmentation or _box_polygon(o.box)
-                annotations.append({**row, "area": o.area, "iscrowd": int(o.crowd), "segmentation": shape})
+                annotations.append(
+                    {**row, "area": o.area, "iscrowd": int(o.crowd), "segmentation": shape}
+                )
         return {"images": images, "categories": categories, "annotations": annotations}
 
 
@@ -114,8 +141,8 @@ def read_folder(
 ) -> CocoFolder:
     """Training and validation data of one or several folders.
 
-    The class map is the first training split's; the other splits must have the same names after the filter, whatever
-    their ids. `paths` overrides the first root's places, or stands alone.
+    The class map is the first training split's; the other splits must have the same names after the
+    filter, whatever their ids. `paths` overrides the first root's places, or stands alone.
     Raises DataError in one line naming file and id.
     """
     paths = paths or CocoPaths()
@@ -123,7 +150,10 @@ def read_folder(
         raise DataError(
             "no data: give a folder (cohdc fit DATA) or data.paths: train_json, train_images, val_json and val_images"
         )
-    found = [paths.split("train") or find_split(roots[0], "train"), *(find_split(r, "train") for r in roots[1:])]
+    found = [
+        paths.split("train") or find_split(roots[0], "train"),
+        *(find_split(r, "train") for r in roots[1:]),
+    ]
     train = [read_split("train", files, classes) for files in found]
     names = train[0].class_names
     val = read_split("val", paths.split("val") or find_split(roots[0], "val"), classes)
@@ -133,15 +163,17 @@ def read_folder(
 def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = None) -> CocoSplit:
     """Read and check one annotation file.
 
-    Segmentations may be polygons, compressed or uncompressed RLE. Objects whose box or contour has no extent inside the
-    image are dropped and counted, and so are boxes without a contour.
+    Segmentations may be polygons, compressed or uncompressed RLE. Objects whose box or contour has
+    no extent inside the image are dropped and counted, and so are boxes without a contour.
     Raises DataError naming the file and the image, annotation or class that cannot be used.
     """
     content = read_json(files.annotations)
     names, labels = _class_map(files.annotations, content["categories"], classes)
     images = {image.id: image for image in (_read_image(files, row) for row in content["images"])}
     if len(images) != len(content["images"]):
-        raise DataError(f"{files.annotations}: {len(content['images']) - len(images)} image ids are used twice")
+        raise DataError(
+            f"{files.annotations}: {len(content['images']) - len(images)} image ids are used twice"
+        )
     objects: dict[int, list[CocoObject]] = {image_id: [] for image_id in images}
     dropped: Counter[str] = Counter()
     clipped = lost = 0
@@ -159,7 +191,9 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         objects[image.id].append(build_object(row, label, segmentation, image))
     kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
     if not any(o for image in kept for o in image.objects if not o.crowd):
-        raise DataError(f"{files.annotations}: no object to learn: {dict(dropped) or 'no annotation of these classes'}")
+        raise DataError(
+            f"{files.annotations}: no object to learn: {dict(dropped) or 'no annotation of these classes'}"
+        )
     return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
 
 
@@ -187,19 +221,27 @@ def _read_image(files: SplitPaths, row: dict[str, Any]) -> CocoImage:
         image_id, height, width = int(row["id"]), int(row["height"]), int(row["width"])
         path = files.images / str(row["file_name"])
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{files.annotations}: image {row}: needs id, file_name, height and width") from error
+        raise DataError(
+            f"{files.annotations}: image {row}: needs id, file_name, height and width"
+        ) from error
     if not path.is_file():
         raise DataError(f"{files.annotations}: image {image_id}: {path} does not exist")
     return CocoImage(image_id, path, height, width, ())
 
 
-def _references(path: Path, row: Any, images: dict[int, CocoImage], labels: dict[int, int]) -> tuple[CocoImage, int]:
+def _references(
+    path: Path, row: Any, images: dict[int, CocoImage], labels: dict[int, int]
+) -> tuple[CocoImage, int]:
     """The image and the label an annotation points at."""
     if not isinstance(row, dict):
-        raise DataError(f"{path}: annotation {row!r:.40}: needs id, image_id, category_id and segmentation")
+        raise DataError(
+            f"{path}: annotation {row!r:.40}: needs id, image_id, category_id and segmentation"
+        )
     for key, known in (("image_id", images), ("category_id", labels)):
         if not isinstance(row.get(key), int | float) or row[key] not in known:
-            raise DataError(f"{path}: annotation {row.get('id')}: {key} {row.get(key)} is not in the file")
+            raise DataError(
+                f"{path}: annotation {row.get('id')}: {key} {row.get(key)} is not in the file"
+            )
     return images[row["image_id"]], labels[row["category_id"]]
 
 

@@ -38,33 +38,42 @@ def convert(
     attribute: str | None = None,
     names: Path | None = None,
 ) -> None:
-    """Make a COCO-format folder of annotations in another format; what cannot be converted is left out and counted.
+    """Make a COCO-format folder of annotations in another format; what cannot be converted is left
+    out and counted.
 
-    Writes `images/` (hard links where possible: do not edit them), `instances_train.json` and `instances_val.json`,
-    all or nothing. Raises DataError in one line that names the file and the row.
+    Writes `images/` (hard links where possible: do not edit them), `instances_train.json` and
+    `instances_val.json`, all or nothing. Raises DataError in one line that names the file and the
+    row.
 
     Args:
-        format: labelme: a folder of images, one JSON each. via: VGG Image Annotator's JSON beside its images. yolo:
-            Ultralytics' data.yaml, or its folder. voc: Pascal VOC's folder of segmentation PNGs, or CVAT's.
+        format: labelme: a folder of images, one JSON each. via: VGG Image Annotator's JSON beside
+            its images. yolo: Ultralytics' data.yaml, or its folder. voc: Pascal VOC's folder of
+            segmentation PNGs, or CVAT's.
         source: the folder, or the annotation file.
         out: the folder to write, absent or empty.
         val: share of the images that go to validation, where the source has no split of its own.
             Images in folders (or of lists) named test are left out and counted.
         seed: of the shuffle that chooses them; the same images for the same seed.
         attribute: via: the region attribute that holds the class, where there are several.
-        names: voc: file with a class per line, or CVAT's labelmap.txt. via: file with the one class of all regions.
+        names: voc: file with a class per line, or CVAT's labelmap.txt. via: file with the one class
+            of all regions.
     """
     with new_folder(out) as draft:
         found = _read(format, source, attribute, names)
         splits = _split(source, found, val, seed)
-        classes = found.class_names or sorted({o.name for images in splits.values() for i in images for o in i.objects})
+        classes = found.class_names or sorted(
+            {o.name for images in splits.values() for i in images for o in i.objects}
+        )
         file_names = _write_images(splits.values(), draft / "images", found)
         for name, images in splits.items():
             content = _content(images, file_names, classes, found)
             if not content["annotations"]:
-                lost = "; ".join(f"{len(places)} left out: {why}" for why, places in found.left_out.items())
+                lost = "; ".join(
+                    f"{len(places)} left out: {why}" for why, places in found.left_out.items()
+                )
                 raise DataError(
-                    f"{source}: no object in {name} of {len(images)} images" + (f"; {lost}" if lost else "")
+                    f"{source}: no object in {name} of {len(images)} images"
+                    + (f"; {lost}" if lost else "")
                 )
             write_text(draft / f"instances_{name}.json", json.dumps(content))
         written = [_read_back(draft, name, out) for name in splits]
@@ -90,9 +99,13 @@ def _read(format: Format, source: Path, attribute: str | None, names: Path | Non
 
 
 def _split(source: Path, found: Source, val: float, seed: int) -> dict[str, list[SourceImage]]:
-    """The source's own split; without one, a share `val` of the images, at least one, drawn by a seeded shuffle."""
+    """The source's own split; without one, a share `val` of the images, at least one, drawn by a
+    seeded shuffle.
+    """
     for images in found.splits.values():
-        path, count = Counter(image.path for image in images).most_common(1)[0] if images else (source, 1)
+        path, count = (
+            Counter(image.path for image in images).most_common(1)[0] if images else (source, 1)
+        )
         if count > 1:
             raise DataError(f"{path}: annotated {count} times")
     if "" not in found.splits:
@@ -101,14 +114,18 @@ def _split(source: Path, found: Source, val: float, seed: int) -> dict[str, list
     if not 0 < val < 1:
         raise DataError(f"--val {val}: must be between 0 and 1")
     if len(images) < 2:
-        raise DataError(f"{source}: {len(images)} image; two or more are needed, one for train and one for val")
+        raise DataError(
+            f"{source}: {len(images)} image; two or more are needed, one for train and one for val"
+        )
     count = min(max(round(val * len(images)), 1), len(images) - 1)
     drawn = set(np.random.default_rng(seed).permutation(len(images))[:count].tolist())
     parts = {"train": [image for i, image in enumerate(images) if i not in drawn]}
     return parts | {"val": [image for i, image in enumerate(images) if i in drawn]}
 
 
-def _write_images(splits: Iterable[Sequence[SourceImage]], folder: Path, found: Source) -> dict[Path, str]:
+def _write_images(
+    splits: Iterable[Sequence[SourceImage]], folder: Path, found: Source
+) -> dict[Path, str]:
     """Write every image once; returns its file name by its path in the source.
 
     A name alone where no other image has it, else all keep the folders they do not share.
@@ -137,9 +154,14 @@ def _write_image(image: SourceImage, target: Path) -> None:
 
 
 def _content(
-    images: Sequence[SourceImage], file_names: Mapping[Path, str], classes: Sequence[str], found: Source
+    images: Sequence[SourceImage],
+    file_names: Mapping[Path, str],
+    classes: Sequence[str],
+    found: Source,
 ) -> dict[str, Any]:
-    """The COCO dict of a split. Objects without a pixel are left out; what reaches out of the image is cut off."""
+    """The COCO dict of a split. Objects without a pixel are left out; what reaches out of the image
+    is cut off.
+    """
     ids = {name: i for i, name in enumerate(classes, start=1)}
     rows: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -152,7 +174,12 @@ def _content(
             if seen.row is None:
                 found.leave_out(kinds.pop(), o.where)
             else:
-                owner = {"id": len(annotations) + 1, "image_id": image_id, "category_id": ids[o.name], "iscrowd": 0}
+                owner = {
+                    "id": len(annotations) + 1,
+                    "image_id": image_id,
+                    "category_id": ids[o.name],
+                    "iscrowd": 0,
+                }
                 annotations.append(owner | seen.row)
             for kind in kinds:
                 found.note(kind, o.where)
@@ -165,7 +192,9 @@ def _read_back(draft: Path, name: str, out: Path) -> CocoSplit:
     files = find_split(draft, name)
     if files.images != draft / "images":
         folder = files.images.relative_to(draft)
-        raise DataError(f"{out}: images in {folder} would be taken for others of the same name; rename the source's")
+        raise DataError(
+            f"{out}: images in {folder} would be taken for others of the same name; rename the source's"
+        )
     return read_split(name, files)
 
 

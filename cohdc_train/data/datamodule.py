@@ -29,7 +29,8 @@ _AUGMENTATION = Augmentation()
 
 @dataclass(frozen=True)
 class Subset:
-    """How many images of each split to use, drawn at random but always the same ones; None uses all.
+    """How many images of each split to use, drawn at random but always the same ones; None uses
+    all.
 
     Attributes:
         train: training images of every root.
@@ -46,10 +47,12 @@ _EVERYTHING = Subset()
 class TrainBatch(NamedTuple):
     """One training batch.
 
-    images: [B, 3, H, W] on the canvas; uint8 from the loader, float32 in 0..1 after the transfer to the device.
-    targets: per image `boxes` [n, 4] xyxy px, `labels` int64 [n] from 1, `masks` uint8 [n, H, W], `ignore` [k, 4] the
-    crowd's boxes, `image_id`, and `size`: (height, width) of the content on the canvas; the rest is padding. With
-    mini-masks `masks` are float16 [n, h, w] on `frames` [n, 4], the boxes.
+    images: [B, 3, H, W] on the canvas; uint8 from the loader, float32 in 0..1 after the transfer to
+    the device.
+    targets: per image `boxes` [n, 4] xyxy px, `labels` int64 [n] from 1, `masks` uint8 [n, H, W],
+    `ignore` [k, 4] the crowd's boxes, `image_id`, and `size`: (height, width) of the content on the
+    canvas; the rest is padding. With mini-masks `masks` are float16 [n, h, w] on `frames` [n, 4],
+    the boxes.
     """
 
     images: Tensor
@@ -74,24 +77,25 @@ class CocoValSet(Dataset[ValSample]):
 class CocoDataModule(pl.LightningDataModule):
     """Training and validation batches from COCO-format folders of any usual layout.
 
-    Validation is on the first root's val split. Several roots train together when they have the same class names after
-    the filter, whatever their ids.
+    Validation is on the first root's val split. Several roots train together when they have the
+    same class names after the filter, whatever their ids.
 
     Args:
         root: the folder, or several.
         classes: use these classes only; None uses all of them.
-        canvas: (height, width) in px every training image is fitted into; the network takes it over. "auto" chooses it
-            from the images, at most 480 x 640 px in area.
-        batch_size: images per batch and device; `cohdc fit` also takes "auto", the most that memory allows.
+        canvas: (height, width) in px every training image is fitted into; the network takes it
+            over. "auto" chooses it from the images, at most 480 x 640 px in area.
+        batch_size: images per batch and device; `cohdc fit` also takes "auto", the most that memory
+            allows.
         workers: processes that read images; 0 reads them in the trainer's own.
         augment: what training images go through.
-        mini_mask: (height, width) in cells at which each training mask is kept, on its box: less memory for many
-            objects, softer contours for large ones. None keeps whole masks.
+        mini_mask: (height, width) in cells at which each training mask is kept, on its box: less
+            memory for many objects, softer contours for large ones. None keeps whole masks.
         subset: how many images of each split to use.
-        overfit: train on so many training images, without augmentation, and validate on the same ones: a check that
-            the labels can be learned at all. 0 is a normal training.
-        cutouts: folders of the same classes whose training objects are pasted into the pictures of `root`, but whose
-            pictures are not trained on; with `augment.copy_paste`.
+        overfit: train on so many training images, without augmentation, and validate on the same
+            ones: a check that the labels can be learned at all. 0 is a normal training.
+        cutouts: folders of the same classes whose training objects are pasted into the pictures of
+            `root`, but whose pictures are not trained on; with `augment.copy_paste`.
         paths: annotation files and image folders, where the layout is an unusual one.
 
     Raises:
@@ -113,7 +117,13 @@ class CocoDataModule(pl.LightningDataModule):
         paths: CocoPaths | None = None,
     ) -> None:
         super().__init__()
-        self.roots = [Path(r) for r in root] if isinstance(root, list) else [] if root is None else [Path(root)]
+        self.roots = (
+            [Path(r) for r in root]
+            if isinstance(root, list)
+            else []
+            if root is None
+            else [Path(root)]
+        )
         self.classes = classes
         self._canvas = canvas
         self.batch_size = batch_size
@@ -125,10 +135,14 @@ class CocoDataModule(pl.LightningDataModule):
             raise DataError(f"overfit {overfit}: the number of images is not negative")
         self.overfit = overfit
         if overfit:
-            self.augment = augment = Augmentation(flip=0.0, scale_jitter=(1.0, 1.0), photometric=False)
+            self.augment = augment = Augmentation(
+                flip=0.0, scale_jitter=(1.0, 1.0), photometric=False
+            )
         self.cutouts = cutouts or []
         if self.cutouts and not augment.copy_paste:
-            raise DataError("data.cutouts are pasted nowhere: give data.augment.copy_paste, a probability")
+            raise DataError(
+                "data.cutouts are pasted nowhere: give data.augment.copy_paste, a probability"
+            )
         self.paths = paths
         self._folder: CocoFolder | None = None
         self._photometric = photometric_augmentation(augment)
@@ -156,7 +170,9 @@ class CocoDataModule(pl.LightningDataModule):
     @cached_property
     def givers(self) -> tuple[CocoSplit, ...]:
         """The training splits whose objects are pasted: those of `root` and of `cutouts`."""
-        given = [read_split("train", find_split(root, "train"), self.classes) for root in self.cutouts]
+        given = [
+            read_split("train", find_split(root, "train"), self.classes) for root in self.cutouts
+        ]
         return (*self.folder.train, *(split.relabelled(self.folder.class_names) for split in given))
 
     @property
@@ -170,7 +186,8 @@ class CocoDataModule(pl.LightningDataModule):
         return len(self.folder.class_names)
 
     def setup(self, stage: str) -> None:
-        """Look at every image file before the first step and say what the annotation files lost in reading.
+        """Look at every image file before the first step and say what the annotation files lost in
+        reading.
 
         Raises DataError naming an image that is missing, damaged or not of its annotated size.
         """
@@ -197,13 +214,19 @@ class CocoDataModule(pl.LightningDataModule):
         return self._loader(CocoValSet(self.folder.val), shuffle=False, collate=list)
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """Training images to float32 in 0..1, unless switched off with kornia's photometry; padding stays 0."""
+        """Training images to float32 in 0..1, unless switched off with kornia's photometry; padding
+        stays 0.
+        """
         if not isinstance(batch, TrainBatch):
             return batch
         images = batch.images.float() / 255
         if self._photometric is not None:
-            for step in self._photometric.children():  # kornia would draw a whole batch of noise on the CPU
-                cast(IntensityAugmentationBase2D, step).set_rng_device_and_dtype(images.device, images.dtype)
+            for step in (
+                self._photometric.children()
+            ):  # kornia would draw a whole batch of noise on the CPU
+                cast(IntensityAugmentationBase2D, step).set_rng_device_and_dtype(
+                    images.device, images.dtype
+                )
             with torch.autocast(images.device.type, enabled=False):
                 images = cast(Tensor, self._photometric(images)).clamp(0, 1)
             images = blank_padding(images, [target["size"] for target in batch.targets])
@@ -229,7 +252,9 @@ def _images(splits: Sequence[CocoSplit]) -> list[CocoImage]:
 
 
 def _collate_train(samples: Sequence[tuple[Tensor, Target]]) -> TrainBatch:
-    return TrainBatch(torch.stack([image for image, _ in samples]), [target for _, target in samples])
+    return TrainBatch(
+        torch.stack([image for image, _ in samples]), [target for _, target in samples]
+    )
 
 
 def _start_worker(worker: int) -> None:

@@ -1,4 +1,6 @@
-"""Image files before training: can they be read, how large are they, do two show the same (Pillow, no torch)."""
+"""Image files before training: can they be read, how large are they, do two show the same (Pillow,
+no torch).
+"""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +24,11 @@ _TAIL = 4096  # bytes at a file's end in which its end mark is looked for
 _END_MARKS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 _PLAIN_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 _SIDE = 16  # px, of a fingerprint
-PROBLEMS = {"missing": "does not exist", "truncated": "ends early", "corrupt": "cannot be read as an image"}
+PROBLEMS = {
+    "missing": "does not exist",
+    "truncated": "ends early",
+    "corrupt": "cannot be read as an image",
+}
 
 
 class ImageFile(NamedTuple):
@@ -108,7 +114,9 @@ def mirrored(prints: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _has_end(path: Path, kind: str | None) -> bool:
-    """Whether the format's end mark stands at the file's end; False when the format has none we know."""
+    """Whether the format's end mark stands at the file's end; False when the format has none we
+    know.
+    """
     mark = _END_MARKS.get(kind or "")
     if mark is None:
         return False

@@ -36,13 +36,17 @@ class CocoPaths:
     val_images: Path | None = None
 
     def split(self, name: str) -> SplitPaths | None:
-        """The named split's paths, or None when neither is given. Raises DataError when only one of the two is."""
+        """The named split's paths, or None when neither is given. Raises DataError when only one of
+        the two is.
+        """
         annotations: Path | None = getattr(self, f"{name}_json")
         images: Path | None = getattr(self, f"{name}_images")
         if annotations is None and images is None:
             return None
         if annotations is None or images is None:
-            raise DataError(f"{name}_json and {name}_images go together; only one of the two is given")
+            raise DataError(
+                f"{name}_json and {name}_images go together; only one of the two is given"
+            )
         return SplitPaths(annotations, images)
 
 
@@ -63,11 +67,15 @@ def find_split(root: Path, name: str) -> SplitPaths:
         return SplitPaths(annotations, annotations.parent)
     places = list(_image_places(root, name))
     images = next((folder for folder in places if _holds_images(folder, annotations)), None)
-    return SplitPaths(annotations, images or next((p for p in places if p.is_dir()), root / "images"))
+    return SplitPaths(
+        annotations, images or next((p for p in places if p.is_dir()), root / "images")
+    )
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file. Raises DataError naming the file when it is missing or no JSON (with the line)."""
+    """The content of a JSON file. Raises DataError naming the file when it is missing or no JSON
+    (with the line).
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -81,7 +89,8 @@ def load_json(path: Path) -> Any:
 def read_json(path: Path) -> dict[str, Any]:
     """An annotation file as a dict with lists `images`, `annotations` and `categories`.
 
-    Raises DataError naming the file when it is missing, is no JSON (with the line), or lacks one of the lists.
+    Raises DataError naming the file when it is missing, is no JSON (with the line), or lacks one of
+    the lists.
     """
     content = load_json(path)
     for key in ("images", "annotations", "categories"):

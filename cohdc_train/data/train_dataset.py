@@ -1,4 +1,6 @@
-"""Training samples: images placed on the canvas, objects of others pasted over them, and what is left of the masks."""
+"""Training samples: images placed on the canvas, objects of others pasted over them, and what is
+left of the masks.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +21,9 @@ _LEFT = 0.1  # share of an object that must still be seen behind what is pasted 
 
 @dataclass(frozen=True)
 class _Scene:
-    """image: uint8 [3, H, W] on the canvas; size: of its content; ignore: [k, 4] xyxy px; objects: labels and masks
-    uint8 [H, W], made one at a time, so that however many a large image has, one mask of its size is in memory.
+    """image: uint8 [3, H, W] on the canvas; size: of its content; ignore: [k, 4] xyxy px; objects:
+    labels and masks uint8 [H, W], made one at a time, so that however many a large image has, one
+    mask of its size is in memory.
     """
 
     image: Tensor
@@ -30,11 +33,12 @@ class _Scene:
 
 
 class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
-    """Augmented training images on the canvas, with boxes recomputed from what is left of the masks.
+    """Augmented training images on the canvas, with boxes recomputed from what is left of the
+    masks.
 
-    images: of every root; canvas: (height, width) px; augment: what they go through; mini_mask: (height, width) in
-    cells that each mask is kept at, on its box, instead of on the canvas; givers: the images whose objects are pasted,
-    `images` themselves when not given.
+    images: of every root; canvas: (height, width) px; augment: what they go through; mini_mask:
+    (height, width) in cells that each mask is kept at, on its box, instead of on the canvas;
+    givers: the images whose objects are pasted, `images` themselves when not given.
     """
 
     def __init__(
@@ -66,7 +70,9 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         """An image and some of its objects on the canvas, as drawn."""
         size = (image.height, image.width)
         placement = Placement.draw(size, self.canvas, self.augment)
-        crowd = torch.tensor([o.box for o in image.objects if o.crowd], dtype=torch.float32).reshape(-1, 4)
+        crowd = torch.tensor(
+            [o.box for o in image.objects if o.crowd], dtype=torch.float32
+        ).reshape(-1, 4)
         crowd[:, 2:] += crowd[:, :2]
         pixels = placement.image(torch.from_numpy(read_image(image)).permute(2, 0, 1))
         masks = ((o.label, placement.mask(torch.from_numpy(o.mask(*size)))) for o in objects)
@@ -86,20 +92,26 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
             over |= mask > 0
         hidden: list[Tensor] = []
         behind = list(_behind(scene.objects, over, hidden))
-        ignore = torch.cat([scene.ignore, mask_boxes(torch.stack(hidden)) if hidden else scene.ignore[:0]])
+        ignore = torch.cat(
+            [scene.ignore, mask_boxes(torch.stack(hidden)) if hidden else scene.ignore[:0]]
+        )
         image = torch.where(over, given.image, scene.image)
         return replace(scene, image=image, ignore=ignore, objects=behind + objects)
 
     def _target(self, scene: _Scene, image_id: int) -> Target:
         """What is left of the scene: objects with a visible pixel, crowd boxes with an area."""
         labels: list[int] = []
-        masks: list[Tensor] = [torch.zeros((0, *(self.mini_mask or self.canvas)), dtype=torch.uint8)]
+        masks: list[Tensor] = [
+            torch.zeros((0, *(self.mini_mask or self.canvas)), dtype=torch.uint8)
+        ]
         boxes = [torch.zeros((0, 4))]
         for label, mask in scene.objects:
             box = mask_boxes(mask[None])
             if box[0, 2] > box[0, 0]:
                 labels.append(label)
-                masks.append(mask[None] if self.mini_mask is None else _minimised(mask, box, self.mini_mask))
+                masks.append(
+                    mask[None] if self.mini_mask is None else _minimised(mask, box, self.mini_mask)
+                )
                 boxes.append(box)
         ignore = scene.ignore
         target = {
@@ -113,7 +125,9 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         return target if self.mini_mask is None else target | {"frames": target["boxes"]}
 
 
-def _behind(objects: Iterable[tuple[int, Tensor]], over: Tensor, hidden: list[Tensor]) -> Iterator[tuple[int, Tensor]]:
+def _behind(
+    objects: Iterable[tuple[int, Tensor]], over: Tensor, hidden: list[Tensor]
+) -> Iterator[tuple[int, Tensor]]:
     """What still shows of objects behind `over`; the rests of those that hardly do go to `hidden`."""
     for label, mask in objects:
         left = mask * ~over
@@ -124,7 +138,11 @@ def _behind(objects: Iterable[tuple[int, Tensor]], over: Tensor, hidden: list[Te
 
 
 def _minimised(mask: Tensor, box: Tensor, size: tuple[int, int]) -> Tensor:
-    """float16 [1, *size]: share of each cell of a grid over its box [1, 4] that a mask [H, W] covers."""
+    """float16 [1, *size]: share of each cell of a grid over its box [1, 4] that a mask [H, W]
+    covers.
+    """
     roi = torch.cat([torch.zeros(1, 1), box], dim=1)
-    covered: Tensor = roi_align(mask[None, None].float(), roi, size, sampling_ratio=-1, aligned=True)
+    covered: Tensor = roi_align(
+        mask[None, None].float(), roi, size, sampling_ratio=-1, aligned=True
+    )
     return covered[0].half()

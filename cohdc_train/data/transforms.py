@@ -27,12 +27,12 @@ class Augmentation:
 
     Attributes:
         flip: probability of a horizontal flip.
-        scale_jitter: smallest and largest scale, relative to the one at which the image just fits into the canvas;
-            drawn per image, it is the multi-scale training.
+        scale_jitter: smallest and largest scale, relative to the one at which the image just fits
+            into the canvas; drawn per image, it is the multi-scale training.
         copy_paste: probability that objects of another training image are pasted over this one.
         photometric: vary brightness, contrast, colour temperature, noise and blur on the device.
-        degrade: probability of each fault that a moving camera's image has: gamma, light that changes across it
-            (a rolling shutter's exposure), motion blur, noise and JPEG.
+        degrade: probability of each fault that a moving camera's image has: gamma, light that
+            changes across it (a rolling shutter's exposure), motion blur, noise and JPEG.
     """
 
     flip: float = 0.5
@@ -52,11 +52,12 @@ class Augmentation:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where an image lands on the canvas: a window of it, scaled into the top left, perhaps mirrored; zeros elsewhere.
+    """Where an image lands on the canvas: a window of it, scaled into the top left, perhaps
+    mirrored; zeros elsewhere.
 
-    The window is cut before it is resized, so that no pixel is computed that would be thrown away. Images are resized
-    bilinearly with antialiasing; masks take the nearest pixel, centre to centre (v2's own rule for masks is half a
-    pixel off).
+    The window is cut before it is resized, so that no pixel is computed that would be thrown away.
+    Images are resized bilinearly with antialiasing; masks take the nearest pixel, centre to centre
+    (v2's own rule for masks is half a pixel off).
 
     Attributes:
         top: first row of the window, image px, and so on.
@@ -77,13 +78,22 @@ class Placement:
     mirrored: bool
 
     @classmethod
-    def draw(cls, image: tuple[int, int], canvas: tuple[int, int], augment: Augmentation) -> "Placement":
+    def draw(
+        cls, image: tuple[int, int], canvas: tuple[int, int], augment: Augmentation
+    ) -> "Placement":
         """A random one for an image of (height, width) px."""
         jitter = float(torch.empty(()).uniform_(*augment.scale_jitter))
         scale = min(c / n for n, c in zip(image, canvas, strict=True)) * jitter
-        rows, columns = (max(1, min(n, round(c / scale))) for n, c in zip(image, canvas, strict=True))
-        size = [max(1, min(c, round(n * scale))) for n, c in zip((rows, columns), canvas, strict=True)]
-        top, left = int(torch.randint(image[0] - rows + 1, ())), int(torch.randint(image[1] - columns + 1, ()))
+        rows, columns = (
+            max(1, min(n, round(c / scale))) for n, c in zip(image, canvas, strict=True)
+        )
+        size = [
+            max(1, min(c, round(n * scale))) for n, c in zip((rows, columns), canvas, strict=True)
+        ]
+        top, left = (
+            int(torch.randint(image[0] - rows + 1, ())),
+            int(torch.randint(image[1] - columns + 1, ())),
+        )
         mirrored = bool(torch.rand(()) < augment.flip)
         return cls(top, left, rows, columns, (size[0], size[1]), canvas, mirrored)
 
@@ -95,13 +105,19 @@ class Placement:
     def mask(self, mask: Tensor) -> Tensor:
         """uint8 [H, W] of 0 and 1 -> [*canvas]."""
         window = mask[self.top : self.top + self.height, self.left : self.left + self.width]
-        return self._finish(F.interpolate(window[None, None], self.size, mode="nearest-exact")[0, 0])
+        return self._finish(
+            F.interpolate(window[None, None], self.size, mode="nearest-exact")[0, 0]
+        )
 
     def boxes(self, boxes: Tensor) -> Tensor:
-        """float32 [n, 4] xyxy, px -> the same on the canvas, clipped to the content; those outside have no extent."""
+        """float32 [n, 4] xyxy, px -> the same on the canvas, clipped to the content; those outside
+        have no extent.
+        """
         image_size = (self.top + self.height, self.left + self.width)
         moved = tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=image_size)
-        moved = F2.resized_crop(moved, self.top, self.left, self.height, self.width, list(self.size))
+        moved = F2.resized_crop(
+            moved, self.top, self.left, self.height, self.width, list(self.size)
+        )
         moved = F2.horizontal_flip(moved) if self.mirrored else moved
         clipped: Tensor = F2.clamp_bounding_boxes(moved).as_subclass(Tensor)
         return clipped
@@ -112,7 +128,9 @@ class Placement:
 
 
 def mask_boxes(masks: Tensor) -> Tensor:
-    """Tight boxes of masks: [n, H, W] -> float32 [n, 4] xyxy, px, x1 and y1 one past the last pixel; 0 where empty."""
+    """Tight boxes of masks: [n, H, W] -> float32 [n, 4] xyxy, px, x1 and y1 one past the last
+    pixel; 0 where empty.
+    """
     columns, rows = masks.amax(dim=1) > 0, masks.amax(dim=2) > 0
     edges = []
     for line in (columns, rows):
@@ -124,9 +142,11 @@ def mask_boxes(masks: Tensor) -> Tensor:
 
 
 def photometric_augmentation(augment: Augmentation) -> AugmentationSequential | None:
-    """Colour, noise, blur and a camera's faults for float images [B, 3, H, W] in 0..1, drawn per image; None for none.
+    """Colour, noise, blur and a camera's faults for float images [B, 3, H, W] in 0..1, drawn per
+    image; None for none.
 
-    Colour varies by the temperature of the light: hue and saturation, through HSV, cost five times as much as the rest.
+    Colour varies by the temperature of the light: hue and saturation, through HSV, cost five times
+    as much as the rest.
     """
     steps: list[IntensityAugmentationBase2D] = []
     if augment.photometric:
@@ -149,7 +169,9 @@ def photometric_augmentation(augment: Augmentation) -> AugmentationSequential | 
 
 
 def blank_padding(images: Tensor, sizes: list[tuple[int, int]]) -> Tensor:
-    """Images [B, 3, H, W] with zeros, in place, outside the (height, width) that each image's content takes."""
+    """Images [B, 3, H, W] with zeros, in place, outside the (height, width) that each image's
+    content takes.
+    """
     for image, (height, width) in zip(images, sizes, strict=True):
         image[:, height:] = 0
         image[:, :, width:] = 0

@@ -15,10 +15,28 @@ from cohdc_train.files import new_folder, sha256
 HOST = "https://cvg.cit.tum.de/rgbd/dataset"
 _PREFIX = "rgbd_dataset_"
 SEQUENCES = (
-    *("freiburg1_xyz", "freiburg1_rpy", "freiburg1_360", "freiburg1_floor", "freiburg1_desk", "freiburg1_desk2"),
-    *("freiburg1_room", "freiburg2_xyz", "freiburg2_rpy", "freiburg2_desk", "freiburg2_desk_with_person"),
+    *(
+        "freiburg1_xyz",
+        "freiburg1_rpy",
+        "freiburg1_360",
+        "freiburg1_floor",
+        "freiburg1_desk",
+        "freiburg1_desk2",
+    ),
+    *(
+        "freiburg1_room",
+        "freiburg2_xyz",
+        "freiburg2_rpy",
+        "freiburg2_desk",
+        "freiburg2_desk_with_person",
+    ),
     *("freiburg3_long_office_household", "freiburg3_sitting_static", "freiburg3_sitting_xyz"),
-    *("freiburg3_sitting_halfsphere", "freiburg3_sitting_rpy", "freiburg3_walking_static", "freiburg3_walking_xyz"),
+    *(
+        "freiburg3_sitting_halfsphere",
+        "freiburg3_sitting_rpy",
+        "freiburg3_walking_static",
+        "freiburg3_walking_xyz",
+    ),
     *("freiburg3_walking_halfsphere", "freiburg3_walking_rpy"),
 )
 _LISTS = ("rgb.txt", "depth.txt")
@@ -26,22 +44,31 @@ _CHUNK = 1 << 20
 
 
 def tum(
-    name: str, *, out: Path = Path("tum"), archive: Path | None = None, digest: str | None = None, host: str = HOST
+    name: str,
+    *,
+    out: Path = Path("tum"),
+    archive: Path | None = None,
+    digest: str | None = None,
+    host: str = HOST,
 ) -> Path:
-    """Fetch a sequence of the TUM RGB-D benchmark, check it, and unpack it into OUT/rgbd_dataset_NAME.
+    """Fetch a sequence of the TUM RGB-D benchmark, check it, and unpack it into
+    OUT/rgbd_dataset_NAME.
 
-    A download that was cut off goes on where it stopped. Every image that rgb.txt and depth.txt list has to be there,
-    or no folder is left. Returns the folder; one that is there already is checked and kept.
+    A download that was cut off goes on where it stopped. Every image that rgb.txt and depth.txt
+    list has to be there, or no folder is left. Returns the folder; one that is there already is
+    checked and kept.
 
     Args:
         name: such as walking_xyz, freiburg3_walking_xyz or rgbd_dataset_freiburg3_walking_xyz.
         out: folder for the archive and the sequence.
         archive: the .tgz, fetched by hand.
-        digest: SHA-256 that the archive must have. The publisher gives none; what was read is printed.
+        digest: SHA-256 that the archive must have. The publisher gives none; what was read is
+            printed.
         host: where the folders freiburg1 to freiburg3 lie.
 
     Raises:
-        DataError: there is no such sequence, the publisher cannot be reached, or the archive is damaged or incomplete.
+        DataError: there is no such sequence, the publisher cannot be reached, or the archive is
+            damaged or incomplete.
     """
     sequence = _sequence(name)
     folder = out / f"{_PREFIX}{sequence}"
@@ -82,7 +109,9 @@ def _sequence(name: str) -> str:
     if len(matches) == 1:
         return matches[0]
     others = ", ".join(matches or SEQUENCES)
-    raise DataError(f"TUM sequence {name!r}: " + (f"is {others}" if matches else f"there are {others}"))
+    raise DataError(
+        f"TUM sequence {name!r}: " + (f"is {others}" if matches else f"there are {others}")
+    )
 
 
 def _download(url: str, file: Path) -> None:
@@ -99,7 +128,9 @@ def _download(url: str, file: Path) -> None:
             with part.open("ab" if have else "wb") as stream:
                 _copy(answer, stream, have, total)
     except (OSError, HTTPException, ValueError) as error:
-        if getattr(error, "code", None) == 416:  # more than all of it is there: of another file, or not renamed
+        if (
+            getattr(error, "code", None) == 416
+        ):  # more than all of it is there: of another file, or not renamed
             part.unlink()
             return _download(url, file)
         reason = getattr(error, "reason", None) or error
@@ -124,14 +155,18 @@ def _copy(answer: Any, stream: Any, done: int, total: int | None) -> None:
 
 
 def _unpack(file: Path, inside: str, target: Path) -> None:
-    """Regular files below the folder `inside` of an archive; nothing that leads out of the target, and no links."""
+    """Regular files below the folder `inside` of an archive; nothing that leads out of the target,
+    and no links.
+    """
     try:
         with tarfile.open(file, "r:gz") as tar:
             for member in tar:
                 path = PurePosixPath(member.name)
                 parts = [part for part in path.parts if part != "."]
                 if path.is_absolute() or ".." in parts or not (member.isfile() or member.isdir()):
-                    raise DataError(f"{file}: entry {member.name!r} is a link or leads out of the folder")
+                    raise DataError(
+                        f"{file}: entry {member.name!r} is a link or leads out of the folder"
+                    )
                 if not member.isfile() or parts[:1] != [inside]:
                     continue
                 place = target.joinpath(*parts[1:])
@@ -144,11 +179,15 @@ def _unpack(file: Path, inside: str, target: Path) -> None:
     except (tarfile.TarError, EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise DataError(f"{file}: not a whole .tgz: {str(error).partition(chr(10))[0]}") from error
     except OSError as error:
-        raise DataError(f"{file}: cannot be unpacked into {target.parent}: {error.strerror}") from error
+        raise DataError(
+            f"{file}: cannot be unpacked into {target.parent}: {error.strerror}"
+        ) from error
 
 
 def _check(folder: Path, named: Path | None = None) -> int:
-    """How many images the lists name, all of them there. Raises DataError naming the first thing that is missing."""
+    """How many images the lists name, all of them there. Raises DataError naming the first thing
+    that is missing.
+    """
     count = 0
     for name in (*_LISTS, "groundtruth.txt"):
         if not (folder / name).is_file():
@@ -159,7 +198,9 @@ def _check(folder: Path, named: Path | None = None) -> int:
             if not words or words[0].startswith("#"):
                 continue
             if len(words) != 2 or not (folder / words[1]).is_file():
-                raise DataError(f"{named or folder}: {name} line {number}: {' '.join(words)!r} is not there")
+                raise DataError(
+                    f"{named or folder}: {name} line {number}: {' '.join(words)!r} is not there"
+                )
             count += 1
     if not count:
         raise DataError(f"{named or folder}: its lists name no image")

@@ -13,21 +13,26 @@ def export(
     allow_drop: bool = False,
     verify_only: bool = False,
 ) -> Path:
-    """Write a checkpoint as an ONNX file that keeps the contract, proven equal to the torch network.
+    """Write a checkpoint as an ONNX file that keeps the contract, proven equal to the torch
+    network.
 
-    The proof runs batches of 1, 2 and 4 at three image sizes, a black image and one full of objects. Images on which
-    torch's own detections hinge on rounding are left out, a quarter at most. Beside the file lies `<file>.json`:
-    largest differences, smallest mask IoU, size, nodes, GFLOPs, and with `--data` both APs.
+    The proof runs batches of 1, 2 and 4 at three image sizes, a black image and one full of
+    objects. Images on which torch's own detections hinge on rounding are left out, a quarter at
+    most. Beside the file lies `<file>.json`: largest differences, smallest mask IoU, size, nodes,
+    GFLOPs, and with `--data` both APs.
 
     Args:
-        checkpoint: a `.ckpt` of `cohdc fit`. With `--verify-only` also an ONNX file, whose report names its checkpoint.
+        checkpoint: a `.ckpt` of `cohdc fit`. With `--verify-only` also an ONNX file, whose report
+            names its checkpoint.
         out: the file to write; `model.onnx` beside the checkpoint when left out.
-        images: folder of pictures to compare on, best with objects on them; drawn shapes when left out.
-        canvas: height and width in px that the file fits images into; the training's when left out. A larger one finds
-            smaller objects and takes longer.
+        images: folder of pictures to compare on, best with objects on them; drawn shapes when left
+            out.
+        canvas: height and width in px that the file fits images into; the training's when left out.
+            A larger one finds smaller objects and takes longer.
         data: COCO-format folder whose validation split both are scored on.
-        int8: folder of pictures such as the robot will see: writes `<file>.int8.onnx` besides, with ranges measured on
-            them. It needs `--data` for its scores, and is refused when mask AP falls by more than a point.
+        int8: folder of pictures such as the robot will see: writes `<file>.int8.onnx` besides, with
+            ranges measured on them. It needs `--data` for its scores, and is refused when mask AP
+            falls by more than a point.
         allow_drop: keep an int8 file that loses more, or that nothing was scored on.
         verify_only: compare `out` as it is and write nothing.
 
@@ -35,8 +40,9 @@ def export(
         The path of the file.
 
     Raises:
-        ExportError: outputs differ by more than 1e-2 px (boxes), 1e-4 (scores), 1e-3 (masks, quality), mask AP by more
-            than a tenth of a point; nothing is left. Or int8 loses too much; only the float32 file is left.
+        ExportError: outputs differ by more than 1e-2 px (boxes), 1e-4 (scores), 1e-3 (masks,
+            quality), mask AP by more than a tenth of a point; nothing is left. Or int8 loses too
+            much; only the float32 file is left.
         CohdcError: the checkpoint or a folder cannot be read.
     """
     from cohdc_train.exporter.steps import run

@@ -16,13 +16,17 @@ from cohdc_train.models import Detector, MaskRCNN
 
 OPSET = 18
 MASK_THRESHOLD = 0.5
-_PER_DETECTION = ("roi_heads.mask_head", "roi_heads.mask_predictor", "cqe")  # modules that see detections only
+_PER_DETECTION = (
+    "roi_heads.mask_head",
+    "roi_heads.mask_predictor",
+    "cqe",
+)  # modules that see detections only
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a network computes: GFLOPs (a multiplication and an addition are two) of one image, and of each detection's
-    mask and quality besides.
+    """What a network computes: GFLOPs (a multiplication and an addition are two) of one image, and
+    of each detection's mask and quality besides.
     """
 
     image: float

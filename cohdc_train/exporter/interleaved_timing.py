@@ -1,4 +1,6 @@
-"""Timing of things that take turns on the same pictures, so that whatever else the machine does hits them all."""
+"""Timing of things that take turns on the same pictures, so that whatever else the machine does
+hits them all.
+"""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -11,8 +13,12 @@ Image = NDArray[np.uint8]
 K = TypeVar("K")
 
 
-def seconds_in_turn(runners: Mapping[K, Callable[[Image], Any]], pictures: Sequence[Image]) -> dict[K, list[float]]:
-    """What each runner took for each picture, uint8 [H, W, 3], s; the first picture is run once before, unmeasured."""
+def seconds_in_turn(
+    runners: Mapping[K, Callable[[Image], Any]], pictures: Sequence[Image]
+) -> dict[K, list[float]]:
+    """What each runner took for each picture, uint8 [H, W, 3], s; the first picture is run once
+    before, unmeasured.
+    """
     seconds: dict[K, list[float]] = {name: [] for name in runners}
     for picture in (pictures[0], *pictures):
         for name, run in runners.items():

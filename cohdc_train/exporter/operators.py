@@ -1,4 +1,6 @@
-"""What the network's custom operators are in ONNX (opset 18), for the translation table of the exporter."""
+"""What the network's custom operators are in ONNX (opset 18), for the translation table of the
+exporter.
+"""
 
 import math
 from collections.abc import Callable
@@ -50,11 +52,15 @@ def letterbox(images: Any, rows: int, columns: int) -> tuple[Any, Any]:
         antialias=1,
         exclude_outside=1,
     )
-    margin = op.Concat(_ints(0, 0, 0, 0, 0, 0), op.Sub(_ints(rows), h), op.Sub(_ints(columns), w), axis=0)
+    margin = op.Concat(
+        _ints(0, 0, 0, 0, 0, 0), op.Sub(_ints(rows), h), op.Sub(_ints(columns), w), axis=0
+    )
     canvas = op.Pad(op.Div(x, _float(255.0)), margin, _float(0.0))
     content = [op.Cast(side, to=_FLOAT) for side in (h, w)]
     image = [op.Cast(side, to=_FLOAT) for side in (height, width)]
-    geometry = op.Concat(*content, op.Div(image[0], content[0]), op.Div(image[1], content[1]), axis=0)
+    geometry = op.Concat(
+        *content, op.Div(image[0], content[0]), op.Div(image[1], content[1]), axis=0
+    )
     return canvas, geometry
 
 
@@ -62,7 +68,11 @@ def nms_keep(boxes: Any, scores: Any, iou_threshold: float, score_threshold: flo
     """`models.ops.nms_keep`: the (image, box) pairs that are kept, scattered into a mask."""
     wanted = op.Gather(op.Shape(scores), _ints(1))
     kept = op.NonMaxSuppression(
-        boxes, op.Unsqueeze(scores, _ints(1)), wanted, _float(iou_threshold), _float(score_threshold)
+        boxes,
+        op.Unsqueeze(scores, _ints(1)),
+        wanted,
+        _float(iou_threshold),
+        _float(score_threshold),
     )
     pairs = op.Gather(kept, _ints(0, 2), axis=1)
     ones = op.Expand(op.Constant(value_int=1), op.Gather(op.Shape(kept), _ints(0)))
@@ -70,9 +80,15 @@ def nms_keep(boxes: Any, scores: Any, iou_threshold: float, score_threshold: flo
     return op.Cast(op.ScatterND(nothing, pairs, ones), to=_BOOL)
 
 
-def roi_pool_levels(features: list[Any], boxes: Any, images: Any, strides: list[int], side: int) -> Any:
-    """`models.ops.roi_pool_levels`: one RoiAlign per level over that level's boxes, put back in the boxes' order."""
-    sides = op.Sub(op.Slice(boxes, _ints(2), _ints(4), _ints(1)), op.Slice(boxes, _ints(0), _ints(2), _ints(1)))
+def roi_pool_levels(
+    features: list[Any], boxes: Any, images: Any, strides: list[int], side: int
+) -> Any:
+    """`models.ops.roi_pool_levels`: one RoiAlign per level over that level's boxes, put back in the
+    boxes' order.
+    """
+    sides = op.Sub(
+        op.Slice(boxes, _ints(2), _ints(4), _ints(1)), op.Slice(boxes, _ints(0), _ints(2), _ints(1))
+    )
     area = op.ReduceProd(sides, _ints(1), keepdims=0)
     octave = op.Log(op.Add(op.Div(op.Sqrt(area), _float(float(CANONICAL_SIDE))), _float(1e-8)))
     level = op.Add(_float(float(CANONICAL_LEVEL)), op.Div(octave, _float(math.log(2.0))))

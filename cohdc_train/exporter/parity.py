@@ -1,8 +1,10 @@
-"""An ONNX file against the network it was written from: the same pictures through both, output by output.
+"""An ONNX file against the network it was written from: the same pictures through both, output by
+output.
 
-Which proposals are kept can hinge on the last bit of two equal scores. A picture on which file and network differ is
-therefore shown to the network again, by itself and changed by far less than a grey level: where the network then
-differs from itself, the picture decides nothing. There may be few of those.
+Which proposals are kept can hinge on the last bit of two equal scores. A picture on which file and
+network differ is therefore shown to the network again, by itself and changed by far less than a
+grey level: where the network then differs from itself, the picture decides nothing. There may be
+few of those.
 """
 
 import math
@@ -25,7 +27,12 @@ from cohdc_train.segmenter.segmenter import open_session
 
 Image = NDArray[np.uint8]
 
-TOLERANCES = {"boxes": 1e-2, "scores": 1e-4, "quality": 1e-3, "masks": 1e-3}  # boxes in px of the input image
+TOLERANCES = {
+    "boxes": 1e-2,
+    "scores": 1e-4,
+    "quality": 1e-3,
+    "masks": 1e-3,
+}  # boxes in px of the input image
 LEAST_MASK_IOU = 0.99  # of an object's pixels in the image, by the file and by the network
 MOST_UNDECIDED = 0.25  # of the images
 _DISTURBANCES = (0.0, 1e-7, 1e-7, 1e-6, 1e-6, 1e-5, 1e-5)  # of white; a grey level is 4e-3
@@ -37,11 +44,13 @@ class Parity:
     """What a comparison found.
 
     Attributes:
-        max_difference: largest absolute difference per output, boxes in px; infinite where the detections differ.
+        max_difference: largest absolute difference per output, boxes in px; infinite where the
+            detections differ.
         mask_iou: smallest IoU of an object's pixels in the image; 1 without a detection.
         detections: how many were compared.
         images: how many.
-        undecided: images of these that were left out, as the network's own detections hinge on rounding.
+        undecided: images of these that were left out, as the network's own detections hinge on
+            rounding.
         cases: size (height, width) px, batch and detections per image of every run.
     """
 
@@ -54,9 +63,17 @@ class Parity:
 
     def __or__(self, other: "Parity") -> "Parity":
         """Both together."""
-        worst = {name: max(self.max_difference[name], other.max_difference[name]) for name in TOLERANCES}
-        counts = (self.detections + other.detections, self.images + other.images, self.undecided + other.undecided)
-        return Parity(worst, min(self.mask_iou, other.mask_iou), *counts, [*self.cases, *other.cases])
+        worst = {
+            name: max(self.max_difference[name], other.max_difference[name]) for name in TOLERANCES
+        }
+        counts = (
+            self.detections + other.detections,
+            self.images + other.images,
+            self.undecided + other.undecided,
+        )
+        return Parity(
+            worst, min(self.mask_iou, other.mask_iou), *counts, [*self.cases, *other.cases]
+        )
 
     def problem(self) -> str | None:
         """The first output that differs by more than it may, in words."""
@@ -71,7 +88,9 @@ class Parity:
         return None
 
     def require(self, file: Path) -> None:
-        """Raise ExportError naming the file when an output differs by more than it may, or too little was decided."""
+        """Raise ExportError naming the file when an output differs by more than it may, or too
+        little was decided.
+        """
         if (problem := self.problem()) is not None:
             raise ExportError(f"{file}: {problem}")
         if self.undecided > MOST_UNDECIDED * self.images:
@@ -95,8 +114,8 @@ class Parity:
 
 
 def compare(network: MaskRCNN, path: Path, pictures: Sequence[Image]) -> Parity:
-    """Run file and network on batches of 1, 2 and 4 at three sizes, on a black image, and on a mosaic of the pictures,
-    which holds as many objects as can be had.
+    """Run file and network on batches of 1, 2 and 4 at three sizes, on a black image, and on a
+    mosaic of the pictures, which holds as many objects as can be had.
     """
     session = open_session(path)
     detector = Detector(network).eval()
@@ -112,13 +131,15 @@ def compare(network: MaskRCNN, path: Path, pictures: Sequence[Image]) -> Parity:
                 found = Parity(images=1, undecided=1)
             parity |= found
         counts = expected[-1].tolist()
-        parity.cases.append({"size": list(batch.shape[1:3]), "batch": len(batch), "detections": counts})
+        parity.cases.append(
+            {"size": list(batch.shape[1:3]), "batch": len(batch), "detections": counts}
+        )
     return parity
 
 
 def _hinges_on_rounding(detector: Detector, image: Image, expected: list[NDArray[Any]]) -> bool:
-    """Whether the network finds something else in an image [H, W, 3] by itself, without those it shared a batch with,
-    or changed by up to a 400th of a grey level."""
+    """Whether the network finds something else in an image [H, W, 3] by itself, without those it
+    shared a batch with, or changed by up to a 400th of a grey level."""
     canvas, geometry = letterbox(torch.from_numpy(image)[None], *detector.network.config.canvas)
     generator = torch.Generator().manual_seed(0)
     for disturbance in _DISTURBANCES:
@@ -133,22 +154,30 @@ def _hinges_on_rounding(detector: Detector, image: Image, expected: list[NDArray
 
 def _batches(canvas: tuple[int, int], pictures: Sequence[Image]) -> list[Image]:
     rows, columns = canvas
-    sizes = ((rows, columns), (columns * 5 // 4, rows * 3 // 2), (rows * 2 // 3 + 1, columns * 3 // 4 + 2))
+    sizes = (
+        (rows, columns),
+        (columns * 5 // 4, rows * 3 // 2),
+        (rows * 2 // 3 + 1, columns * 3 // 4 + 2),
+    )
     batches = []
     for (height, width), batch in zip(sizes, (4, 2, 1), strict=True):
         scene = [_resize(pictures[i % len(pictures)], height, width) for i in range(4)]
         batches += [np.stack(scene[i : i + batch]) for i in range(0, 4, batch)]
     tiles = [_resize(pictures[i % len(pictures)], rows, columns) for i in range(_MOSAIC**2)]
     mosaic = np.concatenate(
-        [np.concatenate(tiles[i : i + _MOSAIC], axis=1) for i in range(0, len(tiles), _MOSAIC)], axis=0
+        [np.concatenate(tiles[i : i + _MOSAIC], axis=1) for i in range(0, len(tiles), _MOSAIC)],
+        axis=0,
     )
     return [*batches, np.zeros((1, rows, columns, 3), np.uint8), mosaic[None]]
 
 
-def _difference(expected: list[NDArray[Any]], actual: list[NDArray[Any]], size: tuple[int, int]) -> Parity:
+def _difference(
+    expected: list[NDArray[Any]], actual: list[NDArray[Any]], size: tuple[int, int]
+) -> Parity:
     """The outputs of one image held against each other.
 
-    Rows of nearly equal score may stand in another order: each is compared with its nearest box of the same label.
+    Rows of nearly equal score may stand in another order: each is compared with its nearest box of
+    the same label.
     """
     pairs = _pairs(expected, actual)
     if pairs is None:
@@ -157,19 +186,26 @@ def _difference(expected: list[NDArray[Any]], actual: list[NDArray[Any]], size: 
     fields = dict(zip(signature.OUTPUTS, zip(expected, actual, strict=True), strict=True))
     for name in TOLERANCES:
         truth, value = fields[name]
-        padding = [float(np.abs(side[len(pairs) :]).max(initial=0.0)) for side in (truth, value)]  # zero on both sides
+        padding = [
+            float(np.abs(side[len(pairs) :]).max(initial=0.0)) for side in (truth, value)
+        ]  # zero on both sides
         rows = [float(np.abs(truth[i] - value[j]).max()) for i, j in pairs]
         parity.max_difference[name] = max([*padding, *rows])
     (boxes, other_boxes), (masks, other_masks) = fields["boxes"], fields["masks"]
     for i, j in pairs:
-        mask, other = paste_roi_mask(masks[i], boxes[i], size), paste_roi_mask(other_masks[j], other_boxes[j], size)
+        mask, other = (
+            paste_roi_mask(masks[i], boxes[i], size),
+            paste_roi_mask(other_masks[j], other_boxes[j], size),
+        )
         union = int((mask | other).sum())
         if union > 100:  # a pixel of a smaller one that flips is rounding, not a difference
             parity.mask_iou = min(parity.mask_iou, int((mask & other).sum()) / union)
     return parity
 
 
-def _pairs(expected: list[NDArray[Any]], actual: list[NDArray[Any]]) -> list[tuple[int, int]] | None:
+def _pairs(
+    expected: list[NDArray[Any]], actual: list[NDArray[Any]]
+) -> list[tuple[int, int]] | None:
     """Rows of the same detection on both sides; None where the detections are not the same."""
     (boxes, labels), (other_boxes, other_labels) = expected[:2], actual[:2]
     count = int(expected[-1])
@@ -188,4 +224,6 @@ def _pairs(expected: list[NDArray[Any]], actual: list[NDArray[Any]]) -> list[tup
 
 
 def _resize(picture: Image, height: int, width: int) -> Image:
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(
+        cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )

@@ -16,16 +16,20 @@ _SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".webp"}
 
 
 def read_images(folder: Path, count: int) -> Iterator[Image]:
-    """`count` pictures (all, when there are fewer) spread evenly over a folder by name, uint8 [H, W, 3] RGB.
+    """`count` pictures (all, when there are fewer) spread evenly over a folder by name, uint8 [H,
+    W, 3] RGB.
 
-    Raises CohdcError naming the folder at once when it holds none, and a file that is no picture when it is reached.
+    Raises CohdcError naming the folder at once when it holds none, and a file that is no picture
+    when it is reached.
     """
     if not folder.is_dir():
         raise CohdcError(f"{folder}: no such folder")
     names = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
     if not names:
         raise CohdcError(f"{folder}: 0 images")
-    chosen = names if len(names) <= count else [names[i * len(names) // count] for i in range(count)]
+    chosen = (
+        names if len(names) <= count else [names[i * len(names) // count] for i in range(count)]
+    )
     return map(_read, chosen)
 
 

@@ -10,7 +10,8 @@ SCORES = ("segm_AP", "segm_AP50", "boundary_AP", "box_AP", "S90_matched", "S90_a
 
 
 class Scorer:
-    """Scores of a network and of files written from it, on the validation split of a COCO-format folder.
+    """Scores of a network and of files written from it, on the validation split of a COCO-format
+    folder.
 
     Raises CohdcError when the folder does not have the checkpoint's classes.
     """
@@ -26,5 +27,7 @@ class Scorer:
 
     def file(self, path: Path) -> dict[str, float]:
         """SCORES of an ONNX file, masks ranked as the network's are."""
-        scores = score_segmenter(Segmenter(path), self._data.folder.val, self._module.rescore).scores
+        scores = score_segmenter(
+            Segmenter(path), self._data.folder.val, self._module.rescore
+        ).scores
         return {name: scores[name] for name in SCORES}

@@ -38,7 +38,9 @@ def run(
 ) -> Path:
     """`cohdc_train.exporter.export.export`."""
     if int8 is not None and data is None and not allow_drop:
-        raise CohdcError(f"{int8}: int8 needs --data, whose AP tells what it loses, or --allow-drop")
+        raise CohdcError(
+            f"{int8}: int8 needs --data, whose AP tells what it loses, or --allow-drop"
+        )
     if verify_only and checkpoint.suffix == ".onnx":
         checkpoint, out = _checkpoint_of(checkpoint), checkpoint
     target = out if out is not None else checkpoint.parent / "model.onnx"
@@ -47,7 +49,11 @@ def run(
     if not verify_only:
         _check_target(target, int8 is not None)
     module = MaskRCNNModule.load(checkpoint, Segmenter(target).canvas if verify_only else canvas)
-    pictures = list(read_images(images, _PARITY_IMAGES)) if images is not None else drawn_images(_PARITY_IMAGES)
+    pictures = (
+        list(read_images(images, _PARITY_IMAGES))
+        if images is not None
+        else drawn_images(_PARITY_IMAGES)
+    )
     scorer = Scorer(module, data, checkpoint) if data is not None else None
     if verify_only:
         print(_describe(target, _prove(module, target, target, pictures, scorer)))
@@ -55,7 +61,9 @@ def run(
     target.parent.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     with _draft(target) as temporary:
-        nodes = write_graph(module.network.float().cpu().eval(), list(module.class_names), temporary)
+        nodes = write_graph(
+            module.network.float().cpu().eval(), list(module.class_names), temporary
+        )
         proof = _prove(module, temporary, target, pictures, scorer)
         report = _facts(module, target, temporary, checkpoint) | {"nodes": nodes} | proof
         report["seconds"] = round(time.monotonic() - started, 1)
@@ -77,19 +85,30 @@ def _prove(
         report["scores"] = {"torch": scorer.network(), "onnx": scorer.file(file)}
         change = report["scores"]["onnx"]["segm_AP"] - report["scores"]["torch"]["segm_AP"]
         if not abs(change) <= _MOST_CHANGE:
-            raise ExportError(f"{name}: mask AP differs from torch's by {change:+.4f}, allowed {_MOST_CHANGE}")
+            raise ExportError(
+                f"{name}: mask AP differs from torch's by {change:+.4f}, allowed {_MOST_CHANGE}"
+            )
     return report
 
 
 def _write_int8(
     target: Path, calibration: Path, report: dict[str, Any], scorer: Scorer | None, allow_drop: bool
 ) -> None:
-    """The int8 form of a proven file, with its own report. Raises ExportError when it loses too much."""
+    """The int8 form of a proven file, with its own report. Raises ExportError when it loses too
+    much.
+    """
     name = _int8_path(target)
     with _draft(name) as temporary:
         operators = quantize(target, temporary, read_images(calibration, CALIBRATION_IMAGES))
-        facts = {key: report[key] for key in ("checkpoint", "checkpoint_sha256", "opset", "contract", "classes")}
-        facts |= {"file": name.name, "bytes": temporary.stat().st_size, "quantised_operators": operators}
+        facts = {
+            key: report[key]
+            for key in ("checkpoint", "checkpoint_sha256", "opset", "contract", "classes")
+        }
+        facts |= {
+            "file": name.name,
+            "bytes": temporary.stat().st_size,
+            "quantised_operators": operators,
+        }
         runners = {"float32": Segmenter(target, threads=1), "int8": Segmenter(temporary, threads=1)}
         taken = seconds_in_turn(runners, list(read_images(calibration, 8)))
         seconds = {kind: statistics.median(times) for kind, times in taken.items()}
@@ -101,7 +120,9 @@ def _write_int8(
             facts["scores"] = scores
             drop = scores["float32"]["segm_AP"] - scores["int8"]["segm_AP"]
             if not drop <= _MOST_DROP and not allow_drop:
-                raise ExportError(f"{name}: mask AP falls by {drop:.3f} in int8, allowed {_MOST_DROP}; --allow-drop")
+                raise ExportError(
+                    f"{name}: mask AP falls by {drop:.3f} in int8, allowed {_MOST_DROP}; --allow-drop"
+                )
             said += "; " + ", ".join(
                 f"{key} {scores['float32'][key]:.3f} -> {scores['int8'][key]:.3f}" for key in SCORES
             )
@@ -145,15 +166,21 @@ def _describe(target: Path, report: dict[str, Any]) -> str:
 
 
 def _checkpoint_of(file: Path) -> Path:
-    """The checkpoint that an ONNX file's report names. Raises CohdcError when it is gone or has changed."""
+    """The checkpoint that an ONNX file's report names. Raises CohdcError when it is gone or has
+    changed.
+    """
     path = _report_path(file)
     try:
         report = json.loads(path.read_text())
         if "quantised_operators" in report:
-            raise CohdcError(f"{file}: is int8, which differs from torch; what it scores is in {path}")
+            raise CohdcError(
+                f"{file}: is int8, which differs from torch; what it scores is in {path}"
+            )
         checkpoint, digest = file.parent / str(report["checkpoint"]), report["checkpoint_sha256"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CohdcError(f"{path}: names no checkpoint; cohdc export CHECKPOINT --out {file} --verify-only") from error
+        raise CohdcError(
+            f"{path}: names no checkpoint; cohdc export CHECKPOINT --out {file} --verify-only"
+        ) from error
     if not checkpoint.is_file():
         raise CohdcError(f"{path}: its checkpoint {checkpoint} is gone")
     if sha256(checkpoint) != digest:
@@ -189,7 +216,9 @@ def _report_path(file: Path) -> Path:
 
 @contextmanager
 def _draft(target: Path) -> Iterator[Path]:
-    """A name to write to, which becomes `target` when the block ends well and is gone when it does not."""
+    """A name to write to, which becomes `target` when the block ends well and is gone when it does
+    not.
+    """
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         yield temporary

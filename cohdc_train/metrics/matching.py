@@ -1,4 +1,6 @@
-"""Who found whom: each image's objects and confident detections, matched; what a validation's pictures count."""
+"""Who found whom: each image's objects and confident detections, matched; what a validation's
+pictures count.
+"""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -20,7 +22,8 @@ class ImageMatch:
         image_id: of the COCO dict.
         objects: its rows without crowds; `segmentation` is a compressed RLE.
         crowds: the crowds' rows, likewise.
-        detections: `encode`'s rows, best score first; those that found nothing and lie in a crowd are left out.
+        detections: `encode`'s rows, best score first; those that found nothing and lie in a crowd
+            are left out.
         found: [objects] index of the detection that found it, -1 where none did.
         overlaps: [detections, objects] mask IoU.
     """
@@ -35,14 +38,18 @@ class ImageMatch:
     @property
     def right(self) -> NDArray[np.bool_]:
         """[objects] found, and as the right class."""
-        same = [i >= 0 and self.detections[i]["category_id"] == o["category_id"] for i, o in self.pairs()]
+        same = [
+            i >= 0 and self.detections[i]["category_id"] == o["category_id"]
+            for i, o in self.pairs()
+        ]
         return np.array(same, np.bool_)
 
     @property
     def score(self) -> float:
-        """How well the image was predicted, 0..1: the sum of the mask IoUs of the objects found as the right class over
-        the number of objects and of detections that found none. A miss and a false detection each count as 0, a wrong
-        class as both. nan where there is nothing to find and nothing was found."""
+        """How well the image was predicted, 0..1: the sum of the mask IoUs of the objects found as
+        the right class over the number of objects and of detections that found none. A miss and a
+        false detection each count as 0, a wrong class as both. nan where there is nothing to find
+        and nothing was found."""
         counted = len(self.objects) + len(self.detections) - int(self.right.sum())
         overlaps = [self.overlaps[i, j] for j, (i, _) in enumerate(self.pairs()) if self.right[j]]
         return float(sum(overlaps)) / counted if counted else np.nan
@@ -59,8 +66,8 @@ class ImageMatch:
 def match_images(results: Results) -> list[ImageMatch]:
     """Every image of a validation, by id.
 
-    At mask IoU >= .5, detections from the best score down take the free object of their class they overlap most, as
-    COCO matches; those left over then take what is still free of any class.
+    At mask IoU >= .5, detections from the best score down take the free object of their class they
+    overlap most, as COCO matches; those left over then take what is still free of any class.
     """
     sizes = {image["id"]: (image["height"], image["width"]) for image in results.truth["images"]}
     truth: dict[int, list[Row]] = defaultdict(list)
@@ -77,8 +84,8 @@ def match_images(results: Results) -> list[ImageMatch]:
 def ranked(matches: Iterable[ImageMatch], count: int) -> tuple[list[ImageMatch], list[ImageMatch]]:
     """The best predicted images, best first, and the worst, worst first, by `ImageMatch.score`.
 
-    At most `count` each and no image in both, unless there is only one; images without a score are in neither. Of equal
-    scores, the image with more objects and detections goes first.
+    At most `count` each and no image in both, unless there is only one; images without a score are
+    in neither. Of equal scores, the image with more objects and detections goes first.
     """
     scored = [match for match in matches if not np.isnan(match.score)]
     count = min(count, max(1, len(scored) // 2))
@@ -90,12 +97,14 @@ def ranked(matches: Iterable[ImageMatch], count: int) -> tuple[list[ImageMatch],
 
 
 def confusion_matrix(matches: Iterable[ImageMatch], classes: int) -> NDArray[np.int64]:
-    """[C + 1, C + 1] counts, true class in rows and predicted class in columns; the last column counts missed objects,
-    the last row false detections."""
+    """[C + 1, C + 1] counts, true class in rows and predicted class in columns; the last column
+    counts missed objects, the last row false detections."""
     counts = np.zeros((classes + 1, classes + 1), np.int64)
     for match in matches:
         for i, o in match.pairs():
-            counts[o["category_id"] - 1, match.detections[i]["category_id"] - 1 if i >= 0 else classes] += 1
+            counts[
+                o["category_id"] - 1, match.detections[i]["category_id"] - 1 if i >= 0 else classes
+            ] += 1
         for i, row in enumerate(match.detections):
             counts[classes, row["category_id"] - 1] += i not in match.found
     return counts
@@ -113,11 +122,15 @@ def _match(image_id: int, truth: Sequence[Row], detections: list[Row]) -> ImageM
             free = np.where(allowed[i] & (found < 0) & (i not in found), overlaps[i], 0.0)
             if free.max(initial=0.0) >= MATCH_IOU:
                 found[free.argmax()] = i
-    in_crowd = _of_one_class(detections, crowds) & (_overlaps(detections, crowds, crowd=True) >= MATCH_IOU)
+    in_crowd = _of_one_class(detections, crowds) & (
+        _overlaps(detections, crowds, crowd=True) >= MATCH_IOU
+    )
     kept = [i for i in range(len(detections)) if i in found or not in_crowd[i].any()]
     place = np.full(len(detections) + 1, -1, np.int64)  # the last one answers for -1
     place[kept] = np.arange(len(kept))
-    return ImageMatch(image_id, objects, crowds, [detections[i] for i in kept], place[found], overlaps[kept])
+    return ImageMatch(
+        image_id, objects, crowds, [detections[i] for i in kept], place[found], overlaps[kept]
+    )
 
 
 def _of_one_class(detections: Sequence[Row], truth: Sequence[Row]) -> NDArray[np.bool_]:

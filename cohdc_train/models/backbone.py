@@ -1,4 +1,6 @@
-"""What every backbone here is: a stem and four stages of strides 4, 8, 16, 32, whose 3x3 convolutions are dilated."""
+"""What every backbone here is: a stem and four stages of strides 4, 8, 16, 32, whose 3x3
+convolutions are dilated.
+"""
 
 import pickle
 from collections import OrderedDict
@@ -45,7 +47,9 @@ class StagedBackbone(nn.Module):
         raise NotImplementedError
 
     def stem(self, x: Tensor) -> Tensor:
-        """x: [B, 3, H, W], normalised by ImageNet's mean and deviation. Returns what the first stage takes."""
+        """x: [B, 3, H, W], normalised by ImageNet's mean and deviation. Returns what the first
+        stage takes.
+        """
         raise NotImplementedError
 
     def field_of_stem(self) -> tuple[int, int]:
@@ -55,8 +59,9 @@ class StagedBackbone(nn.Module):
     def finish(self, rates: Rates, frozen_stages: int) -> None:
         """Dilate, start from He's initialisation, freeze.
 
-        rates: dilation pattern of each of the four stages, cycled over its convolutions; (1,) is a plain stage.
-        Raises ValueError: a pattern leaves holes (they are named), or there are not four patterns.
+        rates: dilation pattern of each of the four stages, cycled over its convolutions; (1,) is a
+        plain stage. Raises ValueError: a pattern leaves holes (they are named), or there are not
+        four patterns.
         """
         if len(rates) != 4:
             raise ValueError(f"HDC rates {tuple(rates)}: {len(rates)} patterns for 4 stages")
@@ -71,8 +76,8 @@ class StagedBackbone(nn.Module):
             frozen.requires_grad_(False)
 
     def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
-        """x: [B, 3, H, W], normalised; sides are multiples of 32. Returns {"0": stride 4, "1": 8, "2": 16, "3": 32}
-        feature maps.
+        """x: [B, 3, H, W], normalised; sides are multiples of 32. Returns {"0": stride 4, "1": 8,
+        "2": 16, "3": 32} feature maps.
         """
         x = self.stem(x)
         features = OrderedDict()
@@ -96,7 +101,9 @@ class StagedBackbone(nn.Module):
         return side
 
     def train(self, mode: bool = True) -> Self:
-        """As nn.Module's, but frozen stages stay in evaluation mode, so that their BatchNorm statistics rest."""
+        """As nn.Module's, but frozen stages stay in evaluation mode, so that their BatchNorm
+        statistics rest.
+        """
         super().train(mode)
         for frozen in self._frozen():
             frozen.eval()
@@ -116,26 +123,33 @@ def dilate(stage: Sequence[nn.Module], pattern: Sequence[int]) -> None:
         conv.dilation = conv.padding = (rate, rate)
 
 
-def load_weights(backbone: StagedBackbone, source: str, state: dict[str, Tensor], name: str) -> None:
+def load_weights(
+    backbone: StagedBackbone, source: str, state: dict[str, Tensor], name: str
+) -> None:
     """Fill a backbone with a state dict; what it has no place for (a classifier) is passed over.
 
-    source: where it came from; name: what it should be. Raises ValueError naming source and the first tensor that does
-    not fit.
+    source: where it came from; name: what it should be. Raises ValueError naming source and the
+    first tensor that does not fit.
     """
     own = backbone.state_dict()
     for key in (key for key in own if not key.endswith("num_batches_tracked")):
         if key not in state:
             raise ValueError(f"{source}: no tensor {key}; these are not {name} weights")
         if state[key].shape != own[key].shape:
-            raise ValueError(f"{source}: {key} is {list(state[key].shape)}, the backbone's {list(own[key].shape)}")
-    backbone.load_state_dict({key: value for key, value in state.items() if key in own}, strict=False)
+            raise ValueError(
+                f"{source}: {key} is {list(state[key].shape)}, the backbone's {list(own[key].shape)}"
+            )
+    backbone.load_state_dict(
+        {key: value for key, value in state.items() if key in own}, strict=False
+    )
 
 
 def read_weights(weights: str, model: str | None) -> dict[str, Tensor]:
-    """Read a state dict: a file that `torch.save` wrote, or torchvision's weights of that name for its model.
+    """Read a state dict: a file that `torch.save` wrote, or torchvision's weights of that name for
+    its model.
 
-    Raises FileNotFoundError when there is no such file and no such name, or the download fails; model is None where
-    nothing is published. Raises ValueError when the file holds no state dict.
+    Raises FileNotFoundError when there is no such file and no such name, or the download fails;
+    model is None where nothing is published. Raises ValueError when the file holds no state dict.
     """
     if Path(weights).is_file():
         return _read_state_dict(Path(weights))
@@ -143,23 +157,34 @@ def read_weights(weights: str, model: str | None) -> dict[str, Tensor]:
     if weights in published:
         try:
             fetched: dict[str, Tensor] = published[weights].get_state_dict(progress=True)
-        except (OSError, RuntimeError) as error:  # no network, or a file that is not the published one
+        except (
+            OSError,
+            RuntimeError,
+        ) as error:  # no network, or a file that is not the published one
             reason = " ".join(str(error).split())
             raise FileNotFoundError(
                 f"{weights} of {model}: the download of {published[weights].url} failed ({reason}); give a local file "
                 "with --pretrained FILE.pth, or start from random weights with --pretrained none"
             ) from error
         return fetched
-    names = f"torchvision's {model} weights are {', '.join(published)}" if model else "torchvision publishes none"
+    names = (
+        f"torchvision's {model} weights are {', '.join(published)}"
+        if model
+        else "torchvision publishes none"
+    )
     raise FileNotFoundError(f"{weights}: no such file, and {names}")
 
 
 def _read_state_dict(path: Path) -> dict[str, Tensor]:
-    """Read the tensors of a file that `torch.save` wrote. Raises ValueError naming the file when it is none."""
+    """Read the tensors of a file that `torch.save` wrote. Raises ValueError naming the file when it
+    is none.
+    """
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
-        raise ValueError(f"{path}: not a file of torch weights: {str(error).partition(chr(10))[0]}") from error
+        raise ValueError(
+            f"{path}: not a file of torch weights: {str(error).partition(chr(10))[0]}"
+        ) from error
     if not isinstance(stored, dict) or not all(torch.is_tensor(value) for value in stored.values()):
         raise ValueError(f"{path}: not a state dict of a backbone, which holds tensors only")
     return dict(stored)

@@ -1,4 +1,6 @@
-"""A network made faster for inference: norms folded into the convolutions before them, weights channels last."""
+"""A network made faster for inference: norms folded into the convolutions before them, weights
+channels last.
+"""
 
 import copy
 
@@ -10,11 +12,13 @@ from cohdc_train.models.mask_rcnn import MaskRCNN
 
 
 def fused(network: MaskRCNN, dtype: torch.dtype | None = None) -> MaskRCNN:
-    """A copy in evaluation mode that finds the same detections within rounding, and cannot be trained.
+    """A copy in evaluation mode that finds the same detections within rounding, and cannot be
+    trained.
 
-    A norm is folded into a convolution where its module names the two one after the other, as every backbone and the
-    pyramid here do. Weights are laid out as [out, kernel, kernel, in]; images follow. dtype: to cast them to, bfloat16
-    under autocast to it, which would else cast them anew for every batch.
+    A norm is folded into a convolution where its module names the two one after the other, as every
+    backbone and the pyramid here do. Weights are laid out as [out, kernel, kernel, in]; images
+    follow. dtype: to cast them to, bfloat16 under autocast to it, which would else cast them anew
+    for every batch.
     """
     copied = copy.deepcopy(network).eval().requires_grad_(False)
     for module, name, norm_name in list(conv_norm_pairs(copied)):

@@ -1,6 +1,8 @@
-"""Contour quality evaluation (paper 2.1.2): a head that regresses how well a predicted mask covers its object.
+"""Contour quality evaluation (paper 2.1.2): a head that regresses how well a predicted mask covers
+its object.
 
-The paper feeds the true contour to the head; at inference there is none, so the truth enters through the target only.
+The paper feeds the true contour to the head; at inference there is none, so the truth enters
+through the target only.
 """
 
 from typing import Literal
@@ -13,14 +15,16 @@ Fusion = Literal["concat", "multiply", "add"]
 
 
 class CQEHead(nn.Module):
-    """Four 3x3 convolutions and three fully connected layers (paper 2.1.2) over an RoI feature and a predicted mask.
+    """Four 3x3 convolutions and three fully connected layers (paper 2.1.2) over an RoI feature and
+    a predicted mask.
 
     How the two meet:
-    - "concat": the mask, max-pooled to the feature's size, is one more channel (Mask Scoring R-CNN);
+    - "concat": the mask, max-pooled to the feature's size, is one more channel (Mask Scoring
+      R-CNN);
     - "multiply": the feature is multiplied by the max-pooled mask (paper, Fig. 5, first structure);
-    - "add": the mask is added to the feature enlarged to twice its size (Fig. 5, second structure; the paper's larger
-      RoI feature is the same one, interpolated), and the first convolution halves it again. A 28 x 28 mask is not
-      pooled, a larger one to 28 x 28.
+    - "add": the mask is added to the feature enlarged to twice its size (Fig. 5, second structure;
+      the paper's larger RoI feature is the same one, interpolated), and the first convolution
+      halves it again. A 28 x 28 mask is not pooled, a larger one to 28 x 28.
 
     Args:
         in_channels: channels of the RoI feature.
@@ -46,11 +50,17 @@ class CQEHead(nn.Module):
         strides = [2 if fusion == "add" else 1, 1, 1, 2]
         layers: list[nn.Module] = []
         for i in range(4):
-            layers += [nn.Conv2d(widths[i], widths[i + 1], 3, stride=strides[i], padding=1), nn.ReLU(inplace=True)]
+            layers += [
+                nn.Conv2d(widths[i], widths[i + 1], 3, stride=strides[i], padding=1),
+                nn.ReLU(inplace=True),
+            ]
         side = (roi_size + 1) // 2
         self.convs = nn.Sequential(*layers)
         self.fcs = nn.Sequential(
-            nn.Linear(channels * side * side, fc), nn.ReLU(inplace=True), nn.Linear(fc, fc), nn.ReLU(inplace=True)
+            nn.Linear(channels * side * side, fc),
+            nn.ReLU(inplace=True),
+            nn.Linear(fc, fc),
+            nn.ReLU(inplace=True),
         )
         self.quality = nn.Linear(fc, num_classes)
         for module in self.modules():
@@ -59,7 +69,8 @@ class CQEHead(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
-        """features: [K, C, 14, 14]; masks: [K, M, M] probabilities of one class, M a multiple of 28.
+        """features: [K, C, 14, 14]; masks: [K, M, M] probabilities of one class, M a multiple of
+        28.
 
         Returns [K, num_classes], linear.
         """
@@ -67,20 +78,25 @@ class CQEHead(nn.Module):
         return quality
 
     def fuse(self, features: Tensor, masks: Tensor) -> Tensor:
-        """What the convolutions see: [K, C + 1, 14, 14], [K, C, 14, 14] or [K, C, 28, 28], as `fusion` says."""
+        """What the convolutions see: [K, C + 1, 14, 14], [K, C, 14, 14] or [K, C, 28, 28], as
+        `fusion` says.
+        """
         scale = masks.shape[-1] // features.shape[-1]
         if self.fusion == "add":
             larger = F.interpolate(features, scale_factor=2.0, mode="bilinear")
             return larger + F.max_pool2d(masks[:, None], kernel_size=scale // 2)
         pooled = F.max_pool2d(masks[:, None], kernel_size=scale)
-        return features * pooled if self.fusion == "multiply" else torch.cat([features, pooled], dim=1)
+        return (
+            features * pooled if self.fusion == "multiply" else torch.cat([features, pooled], dim=1)
+        )
 
 
 def cqe_loss(quality: Tensor, labels: Tensor, targets: Tensor) -> Tensor:
     """Half the mean squared error over RoIs with a target above 0.
 
-    quality: [K, num_classes]; labels: [K] 0-based class; targets: [K]. Without such a RoI the loss is a zero that
-    still reaches every parameter, so that no rank of a distributed run waits for another.
+    quality: [K, num_classes]; labels: [K] 0-based class; targets: [K]. Without such a RoI the loss
+    is a zero that still reaches every parameter, so that no rank of a distributed run waits for
+    another.
     """
     valid = targets > 0
     if not bool(valid.any()):

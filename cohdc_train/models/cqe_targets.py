@@ -1,4 +1,6 @@
-"""What the CQE head regresses: how well a predicted mask covers its whole ground-truth mask (paper 2.1.2)."""
+"""What the CQE head regresses: how well a predicted mask covers its whole ground-truth mask (paper
+2.1.2).
+"""
 
 import math
 from collections.abc import Sequence
@@ -16,16 +18,24 @@ BAND = 0.02  # width of Boundary IoU's band, as a share of the image's diagonal
 
 @torch.no_grad()
 def cqe_targets(
-    masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, kind: Goal = "iou", bands: Sequence[int] = ()
+    masks: Tensor,
+    boxes: Tensor,
+    truth: TrueMasks,
+    matched: Tensor,
+    kind: Goal = "iou",
+    bands: Sequence[int] = (),
 ) -> Tensor:
-    """How well each predicted mask covers its whole ground-truth mask, also what of it lies outside the box.
+    """How well each predicted mask covers its whole ground-truth mask, also what of it lies outside
+    the box.
 
-    masks: [K, M, M] probabilities; boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object; bands: px,
-    of each, for the last two kinds. Returns [K] in 0..1:
-    - "iou": mask IoU, counted on the box's M x M grid, in whose cells the whole object's area is expressed too;
+    masks: [K, M, M] probabilities; boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's
+    object; bands: px, of each, for the last two kinds. Returns [K] in 0..1:
+    - "iou": mask IoU, counted on the box's M x M grid, in whose cells the whole object's area is
+      expressed too;
     - "ciou": (1 + CIoU) / 2 clipped, the paper's S_iou, and 0 where the masks do not meet;
     - "boundary_iou": IoU of the two masks' inner bands (Cheng et al. 2021), on canvas px;
-    - "min": the smaller of mask IoU and Boundary IoU, both on canvas px: what Boundary AP matches by.
+    - "min": the smaller of mask IoU and Boundary IoU, both on canvas px: what Boundary AP matches
+      by.
     """
     if kind in ("boundary_iou", "min"):
         return _on_canvas(masks, boxes, truth, matched, kind == "min", bands)
@@ -41,7 +51,11 @@ def cqe_targets(
         return iou
     cell = (boxes[:, 2:] - boxes[:, :2]) / side
     shape = Shape.of(predicted).placed(cell, boxes[:, :2])
-    other = Shape.of(truth.rasters.to(boxes.dtype)).placed(truth.cells(), truth.frames[:, :2]).chosen(matched)
+    other = (
+        Shape.of(truth.rasters.to(boxes.dtype))
+        .placed(truth.cells(), truth.frames[:, :2])
+        .chosen(matched)
+    )
     return torch.where(iou > 0, 0.5 * (1 + ciou(iou, shape, other)).clamp(0.0, 2.0), 0.0)
 
 
@@ -51,10 +65,11 @@ def band_of(height: int, width: int) -> int:
 
 
 def boundary_iou(a: Tensor, b: Tensor, band: int) -> Tensor:
-    """IoU of what lies within `band` px of the contour, inside the mask; the image's edge is contour too.
+    """IoU of what lies within `band` px of the contour, inside the mask; the image's edge is
+    contour too.
 
-    a, b: [H, W] bool. Returns a scalar, 0 where both are empty. (Cheng et al. 2021: the mask less its erosion by `band`
-    steps of 3 x 3, under a border of zeros.)
+    a, b: [H, W] bool. Returns a scalar, 0 where both are empty. (Cheng et al. 2021: the mask less
+    its erosion by `band` steps of 3 x 3, under a border of zeros.)
     """
     return _iou(*(m & ~_eroded(m, band) for m in (a, b)))
 
@@ -70,9 +85,16 @@ def _iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _on_canvas(
-    masks: Tensor, boxes: Tensor, truth: TrueMasks, matched: Tensor, lesser: bool, bands: Sequence[int]
+    masks: Tensor,
+    boxes: Tensor,
+    truth: TrueMasks,
+    matched: Tensor,
+    lesser: bool,
+    bands: Sequence[int],
 ) -> Tensor:
-    """[K] Boundary IoU, or with `lesser` the smaller of it and mask IoU, pixel by pixel around both masks."""
+    """[K] Boundary IoU, or with `lesser` the smaller of it and mask IoU, pixel by pixel around both
+    masks.
+    """
     shapes = Shape.of(truth.rasters.to(boxes.dtype)).placed(truth.cells(), truth.frames[:, :2])
     scores = boxes.new_zeros(len(boxes))
     for k, (mask, box, g, band) in enumerate(zip(masks, boxes, matched, bands, strict=True)):
@@ -80,7 +102,9 @@ def _on_canvas(
         high = torch.maximum(box[2:], shapes.high[g]).ceil()
         width, height = (int(v) for v in (high - low).clamp(min=1))
         region = torch.cat([low, low + low.new_tensor([width, height])])[None]
-        inside = _within_box(truth.frames[g] - low.repeat(2), height, width)  # RoIAlign repeats the raster's edge
+        inside = _within_box(
+            truth.frames[g] - low.repeat(2), height, width
+        )  # RoIAlign repeats the raster's edge
         true = (truth.within(region, g[None], (height, width), samples=1)[0] >= 0.5) & inside
         predicted = _pasted(mask, box - low.repeat(2), height, width)
         score = boundary_iou(predicted, true, band)
@@ -89,10 +113,17 @@ def _on_canvas(
 
 
 def _pasted(mask: Tensor, box: Tensor, height: int, width: int) -> Tensor:
-    """bool [height, width]: an RoI mask [M, M] laid over its box (xyxy, px), bilinear between cells' centres."""
+    """bool [height, width]: an RoI mask [M, M] laid over its box (xyxy, px), bilinear between
+    cells' centres.
+    """
     axes = []
     for start, end, count in ((box[0], box[2], width), (box[1], box[3], height)):
-        axes.append((torch.arange(count, device=box.device) + 0.5 - start) / (end - start).clamp(min=1e-6) * 2 - 1)
+        axes.append(
+            (torch.arange(count, device=box.device) + 0.5 - start)
+            / (end - start).clamp(min=1e-6)
+            * 2
+            - 1
+        )
     y, x = torch.meshgrid(axes[1], axes[0], indexing="ij")
     grid = torch.stack([x, y], dim=-1)[None].to(mask.dtype)
     sampled = F.grid_sample(mask[None, None], grid, "bilinear", "border", align_corners=False)[0, 0]
@@ -134,10 +165,12 @@ class Shape(NamedTuple):
 
 
 def ciou(iou: Tensor, a: Shape, b: Shape) -> Tensor:
-    """Complete IoU of masks: IoU - rho^2 / c^2 - alpha v (Zheng et al. 2020, with the masks' centroids).
+    """Complete IoU of masks: IoU - rho^2 / c^2 - alpha v (Zheng et al. 2020, with the masks'
+    centroids).
 
-    rho: distance of the centroids; c: diagonal of the smallest box around both; v: how far the aspect ratios of their
-    tight boxes differ, alpha = v / (1 - IoU + v). iou: [K]. Returns [K], above -1.5 and at most 1.
+    rho: distance of the centroids; c: diagonal of the smallest box around both; v: how far the
+    aspect ratios of their tight boxes differ, alpha = v / (1 - IoU + v). iou: [K]. Returns [K],
+    above -1.5 and at most 1.
     """
     distance = (a.centre - b.centre).square().sum(dim=1)
     around = (torch.maximum(a.high, b.high) - torch.minimum(a.low, b.low)).square().sum(dim=1)

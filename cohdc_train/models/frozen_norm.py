@@ -13,12 +13,15 @@ from torchvision.ops import FrozenBatchNorm2d
 class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not typed
     """BatchNorm whose statistics, scale and shift are constants.
 
-    Torchvision's makes two passes over the map, and turns it into float32 in mixed precision; this makes one.
+    Torchvision's makes two passes over the map, and turns it into float32 in mixed precision; this
+    makes one.
     """
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalize x [B, C, H, W]; shape and dtype stay."""
-        return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+        return F.batch_norm(
+            x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
+        )
 
 
 class AppliedNorm(FrozenNorm):
@@ -32,7 +35,8 @@ class AppliedNorm(FrozenNorm):
 class FoldingConv2d(nn.Conv2d):
     """Convolution that applies the frozen norm behind it: its weights are scaled before every pass.
 
-    That costs nothing next to a pass over the map, and the weights and the norm keep their names and values.
+    That costs nothing next to a pass over the map, and the weights and the norm keep their names
+    and values.
     """
 
     norms: list[FrozenNorm]  # one; a list, so that it is no submodule of this too
@@ -48,7 +52,9 @@ class FoldingConv2d(nn.Conv2d):
 
 
 def conv_norm_pairs(network: nn.Module) -> Iterator[tuple[nn.Module, str, str]]:
-    """Yield every convolution with a norm right behind it: the module that has both, and their names in it."""
+    """Yield every convolution with a norm right behind it: the module that has both, and their
+    names in it.
+    """
     for module in network.modules():
         for (name, first), (norm_name, second) in pairwise(module.named_children()):
             if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
@@ -74,5 +80,7 @@ def plain_convolution(convolution: nn.Conv2d) -> nn.Conv2d:
 
 
 def fold_batch_norm(convolution: nn.Conv2d, norm: Any) -> nn.Conv2d:
-    """Return a convolution, without a norm, of which the result is that of the two in evaluation mode."""
+    """Return a convolution, without a norm, of which the result is that of the two in evaluation
+    mode.
+    """
     return fuse_conv_bn_eval(plain_convolution(convolution), norm)

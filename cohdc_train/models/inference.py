@@ -1,6 +1,8 @@
-"""The padded forward: from uint8 images to a fixed number of detections, the same code in torch and in the export.
+"""The padded forward: from uint8 images to a fixed number of detections, the same code in torch and
+in the export.
 
-Rows that hold no detection are zeros behind `count`; only the others go through the mask and CQE heads.
+Rows that hold no detection are zeros behind `count`; only the others go through the mask and CQE
+heads.
 """
 
 from dataclasses import dataclass
@@ -43,7 +45,9 @@ class Detector(torch.nn.Module):
 
     def on_canvas(self, canvas: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
         """The same of what `letterbox` has made of them."""
-        found = detect_on_canvas(self.network, canvas, geometry[None, :2].expand(canvas.shape[0], 2))
+        found = detect_on_canvas(
+            self.network, canvas, geometry[None, :2].expand(canvas.shape[0], 2)
+        )
         boxes = found.boxes * torch.stack([geometry[3], geometry[2], geometry[3], geometry[2]])
         return boxes, found.labels, found.scores, found.quality, found.masks, found.count
 
@@ -52,8 +56,9 @@ class Detector(torch.nn.Module):
 def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
     """Detections of images of any sizes, each in its own pixels.
 
-    images: uint8 [3, H, W] RGB. Returns per image `boxes` [n, 4] xyxy px, `labels` [n] 0-based, `scores` [n],
-    `quality` [n], `masks` [n, M, M] probabilities inside the box. The network should be in evaluation mode.
+    images: uint8 [3, H, W] RGB. Returns per image `boxes` [n, 4] xyxy px, `labels` [n] 0-based,
+    `scores` [n], `quality` [n], `masks` [n, M, M] probabilities inside the box. The network should
+    be in evaluation mode.
     """
     rows, columns = network.config.canvas
     fitted = [letterbox(image.permute(1, 2, 0)[None], rows, columns) for image in images]
@@ -63,13 +68,17 @@ def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
     results = []
     for i in range(len(images)):
         n = int(found.count[i])
-        rest = {name: getattr(found, name)[i, :n] for name in ("labels", "scores", "quality", "masks")}
+        rest = {
+            name: getattr(found, name)[i, :n] for name in ("labels", "scores", "quality", "masks")
+        }
         results.append({"boxes": boxes[i, :n], **rest})
     return results
 
 
 def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> PaddedDetections:
-    """canvas: float [B, 3, H, W] in 0..1; content: [B, 2] height and width in px of what is not padding."""
+    """canvas: float [B, 3, H, W] in 0..1; content: [B, 2] height and width in px of what is not
+    padding.
+    """
     pyramid = network.features(canvas)
     limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
     objectness, deltas = network.rpn.head(list(pyramid.values()))
@@ -88,20 +97,31 @@ def _classify(
     config, heads = network.config, network.roi_heads
     batch, rois = proposals.shape[:2]
     images = torch.arange(batch, device=proposals.device).repeat_interleave(rois)
-    pooled = roi_pool_levels(levels, proposals.reshape(batch * rois, 4), images, config.roi_strides(), 7)
+    pooled = roi_pool_levels(
+        levels, proposals.reshape(batch * rois, 4), images, config.roi_strides(), 7
+    )
     logits, deltas = heads.box_predictor(heads.box_head(pooled))
     classes = network.num_classes
     scores = logits.float().softmax(dim=1)[:, 1:].reshape(batch, rois * classes)
     deltas = deltas.float().reshape(batch, rois * (classes + 1), 4)
-    solid = is_solid(proposals)[:, :, None].expand(batch, rois, classes).reshape(batch, rois * classes)
+    solid = (
+        is_solid(proposals)[:, :, None].expand(batch, rois, classes).reshape(batch, rois * classes)
+    )
     scores, index = torch.where(solid, scores, 0.0).topk(min(_CANDIDATES, rois * classes), dim=1)
     roi, label = index // classes, index % classes
     deltas = deltas.gather(1, (roi * (classes + 1) + label + 1)[:, :, None].expand(-1, -1, 4))
-    boxes = decode(deltas, proposals.gather(1, roi[:, :, None].expand(-1, -1, 4)), heads.box_coder.weights, limit)
+    boxes = decode(
+        deltas,
+        proposals.gather(1, roi[:, :, None].expand(-1, -1, 4)),
+        heads.box_coder.weights,
+        limit,
+    )
     scores = torch.where(is_solid(boxes), scores, 0.0)
     apart = label.float() * (max(config.canvas) + 1.0)  # no two classes overlap
     keep = nms_keep(boxes + apart[:, :, None], scores, config.nms_iou, config.score_threshold)
-    scores, best = torch.where(keep, scores, 0.0).topk(min(config.detections, scores.shape[1]), dim=1)
+    scores, best = torch.where(keep, scores, 0.0).topk(
+        min(config.detections, scores.shape[1]), dim=1
+    )
     present = scores > 0
     boxes = boxes.gather(1, best[:, :, None].expand(-1, -1, 4)) * present[:, :, None]
     return boxes, label.gather(1, best) * present, scores, present.sum(dim=1)
@@ -110,16 +130,22 @@ def _classify(
 def _segment(
     network: MaskRCNN, levels: list[Tensor], boxes: Tensor, labels: Tensor, count: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Masks [B, N, M, M] and quality [B, N] of the predicted classes; zeros in rows at or behind count [B]."""
+    """Masks [B, N, M, M] and quality [B, N] of the predicted classes; zeros in rows at or behind
+    count [B].
+    """
     heads = network.roi_heads
     batch, n = labels.shape
     present = torch.arange(n, device=count.device)[None] < count[:, None]
     rows = rows_to_segment(present.reshape(batch * n))
     label = labels.reshape(batch * n)[rows]
-    pooled = roi_pool_levels(levels, boxes.reshape(batch * n, 4)[rows], rows // n, network.config.roi_strides(), 14)
+    pooled = roi_pool_levels(
+        levels, boxes.reshape(batch * n, 4)[rows], rows // n, network.config.roi_strides(), 14
+    )
     logits = heads.mask_predictor(heads.mask_head(pooled))
     side = logits.shape[-1]
-    masks = logits.gather(1, (label + 1)[:, None, None, None].expand(-1, 1, side, side))[:, 0].sigmoid()
+    masks = logits.gather(1, (label + 1)[:, None, None, None].expand(-1, 1, side, side))[
+        :, 0
+    ].sigmoid()
     if network.cqe is None:
         quality = masks.new_ones(len(rows), dtype=torch.float32)
     else:
@@ -127,7 +153,11 @@ def _segment(
     masks = masks.float()
     if network.config.mask_cut == "quality":
         masks = cut_by_quality(masks, quality)
-    padded = masks.new_zeros((batch * n, side, side)).index_put((rows,), masks).reshape(batch, n, side, side)
+    padded = (
+        masks.new_zeros((batch * n, side, side))
+        .index_put((rows,), masks)
+        .reshape(batch, n, side, side)
+    )
     each = quality.new_zeros((batch * n,)).index_put((rows,), quality).reshape(batch, n)
     return padded * present[:, :, None, None], each * present
 
@@ -135,9 +165,10 @@ def _segment(
 def cut_by_quality(masks: Tensor, quality: Tensor) -> Tensor:
     """Masks [n, M, M] of probabilities, moved so that 0.5 is the cut of the greatest expected IoU.
 
-    quality: [n] estimates q of the IoU. A pixel of probability p that joins a mask adds p to its intersection with the
-    object and 1 - p to their union. That raises their ratio where p / (1 - p) exceeds it, so the cut lies at
-    q / (1 + q): at 0.5 for a perfect mask, lower for one in doubt, whose doubtful rim rather belongs to it than not.
+    quality: [n] estimates q of the IoU. A pixel of probability p that joins a mask adds p to its
+    intersection with the object and 1 - p to their union. That raises their ratio where p / (1 - p)
+    exceeds it, so the cut lies at q / (1 + q): at 0.5 for a perfect mask, lower for one in doubt,
+    whose doubtful rim rather belongs to it than not.
     """
     ratio = quality.clamp(min=_LEAST_IOU)[:, None, None]
     return masks / (masks + ratio * (1.0 - masks))

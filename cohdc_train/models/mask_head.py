@@ -13,7 +13,9 @@ MaskSize = Literal[28, 56]
 
 
 def mask_predictor(channels: int, classes: int, side: MaskSize) -> nn.Sequential:
-    """Features [K, channels, 14, 14] -> logits [K, classes, side, side]: torchvision's; 56 takes one more step."""
+    """Features [K, channels, 14, 14] -> logits [K, classes, side, side]: torchvision's; 56 takes
+    one more step.
+    """
     once: nn.Sequential = MaskRCNNPredictor(channels, channels, classes)
     if side == 28:
         return once
@@ -21,14 +23,18 @@ def mask_predictor(channels: int, classes: int, side: MaskSize) -> nn.Sequential
     nn.init.kaiming_normal_(again.weight, mode="fan_out", nonlinearity="relu")
     layers = OrderedDict(once.named_children())
     last = layers.pop("mask_fcn_logits")
-    return nn.Sequential(OrderedDict(**layers, conv6_mask=again, relu6=nn.ReLU(inplace=True), mask_fcn_logits=last))
+    return nn.Sequential(
+        OrderedDict(**layers, conv6_mask=again, relu6=nn.ReLU(inplace=True), mask_fcn_logits=last)
+    )
 
 
 def mask_loss(logits: Tensor, truth: TrueMasks, boxes: Tensor, matched: Tensor) -> Tensor:
-    """Binary cross-entropy of masks [K, M, M] (logits) with the share of every cell that the object covers.
+    """Binary cross-entropy of masks [K, M, M] (logits) with the share of every cell that the object
+    covers.
 
-    boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object. The targets are soft and lie on the grid by
-    which masks are pasted; Matterport's are rounded, torchvision's half a pixel off.
+    boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object. The targets are soft and
+    lie on the grid by which masks are pasted; Matterport's are rounded, torchvision's half a pixel
+    off.
     """
     if not len(boxes):
         return logits.sum() * 0

@@ -1,6 +1,7 @@
 """HDC Mask R-CNN with a CQE head: the parts, and the losses that train them (paper 2.1).
 
-Torchvision's detection parts wherever they fit, under torchvision's names, so that its Mask R-CNN state dicts load.
+Torchvision's detection parts wherever they fit, under torchvision's names, so that its Mask R-CNN
+state dicts load.
 """
 
 from collections import OrderedDict
@@ -40,25 +41,31 @@ class NetworkConfig:
         depth: ResNet of 18, 34, 50 or 101 layers.
         width: channels of the backbone as a share of ResNet's.
         rates: dilation patterns of the four stages.
-        weights: torchvision name or local path of ImageNet weights for the backbone; None trains from scratch.
-        norm: of the backbone, and "batch" of the pyramid too: "batch" trains BatchNorm, "frozen" keeps the statistics
-            of the initial weights, "auto" is "frozen" with initial weights and "batch" without.
-        head_norm: "batch" trains BatchNorm in the pyramid and the mask head whatever the backbone has; exported, it
-            costs nothing.
-        frozen_stages: how many of the stem and the four stages are not trained; None is 2 with initial weights, as in
-            torchvision, and 0 without.
+        weights: torchvision name or local path of ImageNet weights for the backbone; None trains
+            from scratch.
+        norm: of the backbone, and "batch" of the pyramid too: "batch" trains BatchNorm, "frozen"
+            keeps the statistics of the initial weights, "auto" is "frozen" with initial weights and
+            "batch" without.
+        head_norm: "batch" trains BatchNorm in the pyramid and the mask head whatever the backbone
+            has; exported, it costs nothing.
+        frozen_stages: how many of the stem and the four stages are not trained; None is 2 with
+            initial weights, as in torchvision, and 0 without.
         canvas: (height, width) in px every image is fitted into.
-        finest_stride: of the pyramid: 4, or 8 without the level that costs most and sees the smallest objects.
-        anchor_scales: side of the anchors in px, one per pyramid level from the finest; one more adds the pool level.
+        finest_stride: of the pyramid: 4, or 8 without the level that costs most and sees the
+            smallest objects.
+        anchor_scales: side of the anchors in px, one per pyramid level from the finest; one more
+            adds the pool level.
         fpn_channels: width of the pyramid, and of the RPN and mask heads.
         fc: width of the box and CQE heads' fully connected layers.
-        cqe: how the CQE head joins feature and mask ("concat", "multiply", "add"); "off" leaves the head out, and
-            quality is then 1.
-        cqe_target: what the CQE head regresses: mask IoU ("iou"), (1 + CIoU) / 2 ("ciou", the paper's S_iou),
-            Boundary IoU ("boundary_iou"), or the smaller of it and mask IoU ("min").
+        cqe: how the CQE head joins feature and mask ("concat", "multiply", "add"); "off" leaves the
+            head out, and quality is then 1.
+        cqe_target: what the CQE head regresses: mask IoU ("iou"), (1 + CIoU) / 2 ("ciou", the
+            paper's S_iou), Boundary IoU ("boundary_iou"), or the smaller of it and mask IoU
+            ("min").
         mask_size: side of the predicted masks, cells: 28, or 56 by one more deconvolution.
-        mask_cut: what a mask's 0.5 stands for at inference: as likely as not ("half"), or the cut of the greatest
-            expected IoU by CQE's estimate of it ("quality", `inference.cut_by_quality`).
+        mask_cut: what a mask's 0.5 stands for at inference: as likely as not ("half"), or the cut
+            of the greatest expected IoU by CQE's estimate of it ("quality",
+            `inference.cut_by_quality`).
         proposals: proposals kept per image in training and at inference.
         rois: proposals per image that train the box head, a quarter of them positive.
         detections: rows of the padded output.
@@ -92,18 +99,25 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         levels, scales = len(self.roi_strides()), len(self.anchor_scales)
         if scales not in (levels, levels + 1):
-            raise ValueError(f"anchor_scales {self.anchor_scales}: {scales} scales for {levels} or {levels + 1} levels")
+            raise ValueError(
+                f"anchor_scales {self.anchor_scales}: {scales} scales for {levels} or {levels + 1} levels"
+            )
         if self.frozen_stages is not None and not 0 <= self.frozen_stages <= 5:
-            raise ValueError(f"frozen_stages {self.frozen_stages}: a ResNet has a stem and 4 stages")
+            raise ValueError(
+                f"frozen_stages {self.frozen_stages}: a ResNet has a stem and 4 stages"
+            )
         if self.mask_cut == "quality" and (self.cqe == "off" or self.cqe_target != "iou"):
             raise ValueError("mask_cut quality needs a CQE head that estimates the mask's IoU")
         if self.weights is not None and self.width != 1.0:
-            raise ValueError(f"weights {self.weights} are of full width, the backbone of width {self.width}")
+            raise ValueError(
+                f"weights {self.weights} are of full width, the backbone of width {self.width}"
+            )
 
     def resolved(self, pretrained: bool) -> "NetworkConfig":
         """Return a copy in which norm and frozen_stages are decided.
 
-        pretrained: whether training starts from trained weights of the backbone, of this config or elsewhere.
+        pretrained: whether training starts from trained weights of the backbone, of this config or
+        elsewhere.
         """
         norm: Norm = ("frozen" if pretrained else "batch") if self.norm == "auto" else self.norm
         frozen = (2 if pretrained else 0) if self.frozen_stages is None else self.frozen_stages
@@ -136,12 +150,18 @@ class Backbone(nn.Module):
             self.body.load(config.weights)
         pool = LastLevelMaxPool() if len(config.anchor_scales) > len(self.levels) else None
         norm = nn.BatchNorm2d if "batch" in (config.norm, config.head_norm) else None
-        self.fpn = FeaturePyramidNetwork(self.body.out_channels[-len(self.levels) :], config.fpn_channels, pool, norm)
+        self.fpn = FeaturePyramidNetwork(
+            self.body.out_channels[-len(self.levels) :], config.fpn_channels, pool, norm
+        )
 
     def forward(self, x: Tensor) -> "OrderedDict[str, Tensor]":
-        """x: [B, 3, H, W] normalised. Returns the pyramid: "0" at stride 4 to "3" at 32, perhaps "pool" at 64."""
+        """x: [B, 3, H, W] normalised. Returns the pyramid: "0" at stride 4 to "3" at 32, perhaps
+        "pool" at 64.
+        """
         stages = self.body(x)
-        features: OrderedDict[str, Tensor] = self.fpn(OrderedDict((name, stages[name]) for name in self.levels))
+        features: OrderedDict[str, Tensor] = self.fpn(
+            OrderedDict((name, stages[name]) for name in self.levels)
+        )
         return features
 
 
@@ -176,18 +196,23 @@ class MaskRCNN(nn.Module):
         self.register_buffer("std", torch.tensor(STD).view(3, 1, 1), persistent=False)
 
     def features(self, images: Tensor) -> "OrderedDict[str, Tensor]":
-        """images: float [B, 3, H, W] in 0..1. Returns the feature pyramid; sides are padded to multiples of 32 px."""
+        """images: float [B, 3, H, W] in 0..1. Returns the feature pyramid; sides are padded to
+        multiples of 32 px.
+        """
         height, width = images.shape[-2:]
         x = (images - self.mean) / self.std
-        pyramid: OrderedDict[str, Tensor] = self.backbone(F.pad(x, (0, -width % 32, 0, -height % 32)))
+        pyramid: OrderedDict[str, Tensor] = self.backbone(
+            F.pad(x, (0, -width % 32, 0, -height % 32))
+        )
         return pyramid
 
     def losses(self, images: Tensor, targets: list[Target]) -> dict[str, Tensor]:
         """The scalar losses of one batch; their sum trains the network.
 
-        images: float [B, 3, H, W] in 0..1 on the canvas; targets: per image `boxes` [n, 4] xyxy px, `labels` [n] from
-        1, `masks` [n, H, W] of 0 and 1 (or mini-masks [n, h, w] with their `frames`, see TrueMasks), and `ignore`
-        [k, 4], the crowd's boxes. n may be 0. `size`: (height, width) of what is no padding, the canvas' when missing.
+        images: float [B, 3, H, W] in 0..1 on the canvas; targets: per image `boxes` [n, 4] xyxy px,
+        `labels` [n] from 1, `masks` [n, H, W] of 0 and 1 (or mini-masks [n, h, w] with their
+        `frames`, see TrueMasks), and `ignore` [k, 4], the crowd's boxes. n may be 0. `size`:
+        (height, width) of what is no padding, the canvas' when missing.
         """
         features = self.features(images)
         sizes = [(images.shape[-2], images.shape[-1])] * len(targets)
@@ -209,11 +234,15 @@ class MaskRCNN(nn.Module):
     def _sample(
         self, proposals: list[Tensor], targets: list[Target]
     ) -> tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]:
-        """Proposals that train the heads: their boxes, matched object, label and box deltas, per image."""
+        """Proposals that train the heads: their boxes, matched object, label and box deltas, per
+        image.
+        """
         heads = self.roi_heads
         gt_boxes = [t["boxes"].to(proposals[0].dtype) for t in targets]
         proposals = heads.add_gt_proposals(proposals, gt_boxes)
-        matched, labels = heads.assign_targets_to_proposals(proposals, gt_boxes, [t["labels"] for t in targets])
+        matched, labels = heads.assign_targets_to_proposals(
+            proposals, gt_boxes, [t["labels"] for t in targets]
+        )
         for label, proposal, target in zip(labels, proposals, targets, strict=True):
             label[(label == 0) & in_crowd(proposal, target)] = -1
         chosen = heads.subsample(labels)
@@ -221,7 +250,8 @@ class MaskRCNN(nn.Module):
         labels = [label[c] for label, c in zip(labels, chosen, strict=True)]
         matched = [m[c] for m, c in zip(matched, chosen, strict=True)]
         truths = [
-            boxes[m] if len(boxes) else boxes.new_zeros((len(m), 4)) for boxes, m in zip(gt_boxes, matched, strict=True)
+            boxes[m] if len(boxes) else boxes.new_zeros((len(m), 4))
+            for boxes, m in zip(gt_boxes, matched, strict=True)
         ]
         return proposals, matched, labels, list(heads.box_coder.encode(truths, proposals))
 
@@ -241,7 +271,8 @@ class MaskRCNN(nn.Module):
         matches = [m[p] for m, p in zip(matched, positive, strict=True)]
         pooled = heads.mask_roi_pool(features, boxes, sizes)
         logits = heads.mask_predictor(heads.mask_head(pooled)).float()
-        # The losses turn masks into float32: only those of the sampled objects, however many the image has.
+        # The losses turn masks into float32: only those of the sampled objects, however many the
+        # image has.
         keys = [key for key in ("masks", "frames") if key in targets[0]]
         with torch.autocast(logits.device.type, enabled=False):
             # Autocast to bfloat16 on a CPU cannot concatenate the float16 of mini-masks.
@@ -257,7 +288,11 @@ class MaskRCNN(nn.Module):
             return losses
         probabilities = chosen_logits.sigmoid()
         quality = self.cqe(pooled, probabilities.to(pooled.dtype))
-        bands = [band_of(*t.get("size", sizes[0])) for t, b in zip(targets, boxes, strict=True) for _ in range(len(b))]
+        bands = [
+            band_of(*t.get("size", sizes[0]))
+            for t, b in zip(targets, boxes, strict=True)
+            for _ in range(len(b))
+        ]
         goals = cqe_targets(probabilities, where, truth, objects, self.config.cqe_target, bands)
         losses["cqe"] = cqe_loss(quality, classes - 1, goals)
         return losses
@@ -278,6 +313,8 @@ def _build_roi_heads(config: NetworkConfig, num_classes: int) -> RoIHeads:
         nms_thresh=config.nms_iou,
         detections_per_img=config.detections,
         mask_roi_pool=MultiScaleRoIAlign(config.roi_levels(), 14, 2),
-        mask_head=MaskRCNNHeads(channels, (channels,) * 4, 1, nn.BatchNorm2d if config.head_norm == "batch" else None),
+        mask_head=MaskRCNNHeads(
+            channels, (channels,) * 4, 1, nn.BatchNorm2d if config.head_norm == "batch" else None
+        ),
         mask_predictor=mask_predictor(channels, num_classes + 1, config.mask_size),
     )

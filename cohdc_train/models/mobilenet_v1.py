@@ -19,12 +19,24 @@ from cohdc_train.models.backbone import (
 )
 
 _EPS = 1e-3  # TensorFlow's, with which the published weights were trained
-_BLOCKS = ((64, 1), (128, 2), (128, 1), (256, 2), (256, 1), (512, 2), *((512, 1),) * 5, (1024, 2), (1024, 1))
+_BLOCKS = (
+    (64, 1),
+    (128, 2),
+    (128, 1),
+    (256, 2),
+    (256, 1),
+    (512, 2),
+    *((512, 1),) * 5,
+    (1024, 2),
+    (1024, 1),
+)
 _STAGES = ((0, 3), (3, 5), (5, 11), (11, 13))  # blocks of each stage: strides 4, 8, 16, 32
 
 
 class _ConvNorm(nn.Module):
-    """Convolution, norm, ReLU6; a stride of 2 pads below and right only, as TensorFlow does with even sides."""
+    """Convolution, norm, ReLU6; a stride of 2 pads below and right only, as TensorFlow does with
+    even sides.
+    """
 
     def __init__(self, conv: nn.Conv2d, norm: nn.Module) -> None:
         super().__init__()
@@ -39,7 +51,9 @@ class _ConvNorm(nn.Module):
 class _Separable(nn.Module):
     """A depthwise 3x3 and a pointwise convolution."""
 
-    def __init__(self, channels: int, out: int, stride: int, norm: Callable[[int], nn.Module]) -> None:
+    def __init__(
+        self, channels: int, out: int, stride: int, norm: Callable[[int], nn.Module]
+    ) -> None:
         super().__init__()
         padding = 1 if stride == 1 else 0
         depthwise = nn.Conv2d(channels, channels, 3, stride, padding, groups=channels, bias=False)
@@ -54,8 +68,9 @@ class _Separable(nn.Module):
 class MobileNetV1(StagedBackbone):
     """MobileNetV1 whose depthwise convolutions may follow a dilation pattern inside each stage.
 
-    The tensors' names are `stem.{conv,bn}` and `blocks.N.{dw,pw}.{conv,bn}`; weights are those of TensorFlow's network,
-    which takes pixels in -1..1: the input is brought there from ImageNet's normalisation.
+    The tensors' names are `stem.{conv,bn}` and `blocks.N.{dw,pw}.{conv,bn}`; weights are those of
+    TensorFlow's network, which takes pixels in -1..1: the input is brought there from ImageNet's
+    normalisation.
 
     Args:
         width: channels as a share of the network's (32 to 1024), rounded to multiples of 8.
@@ -101,8 +116,11 @@ class MobileNetV1(StagedBackbone):
         return 3, 2
 
     def load(self, weights: str) -> None:
-        """Fill a full-width network from a state dict. Raises ValueError as `load_weights`; FileNotFoundError when
-        there is no such file: torchvision publishes none under a name.
+        """Fill a full-width network from a state dict. Raises ValueError as `load_weights`;
+        FileNotFoundError when there is no such file: torchvision publishes none under a name.
         """
-        state = {key.replace("stem.", "stem_block."): value for key, value in read_weights(weights, None).items()}
+        state = {
+            key.replace("stem.", "stem_block."): value
+            for key, value in read_weights(weights, None).items()
+        }
         load_weights(self, weights, state, "MobileNetV1")

@@ -3,13 +3,27 @@
 from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
-from cohdc_train.models.backbone import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights
+from cohdc_train.models.backbone import (
+    Norm,
+    Rates,
+    StagedBackbone,
+    load_weights,
+    norm_layer,
+    read_weights,
+)
 
-_PARTS = ((0, 2), (2, 4), (4, 7), (7, 14), (14, 18))  # modules of the stem and the stages of strides 4, 8, 16, 32
+_PARTS = (
+    (0, 2),
+    (2, 4),
+    (4, 7),
+    (7, 14),
+    (14, 18),
+)  # modules of the stem and the stages of strides 4, 8, 16, 32
 
 
 class MobileNetV2(StagedBackbone):
-    """MobileNetV2 without its last convolution; the depthwise ones may follow a dilation pattern inside each stage.
+    """MobileNetV2 without its last convolution; the depthwise ones may follow a dilation pattern
+    inside each stage.
 
     Args:
         width: channels as a share of the network's, rounded to multiples of 8.
@@ -46,7 +60,8 @@ class MobileNetV2(StagedBackbone):
         return 3 + 2 * 2, 2
 
     def load(self, weights: str) -> None:
-        """Fill a full-width network: a torchvision name or the path of a state dict (`classifier.*` is passed over).
+        """Fill a full-width network: a torchvision name or the path of a state dict (`classifier.*`
+        is passed over).
 
         Raises ValueError as `load_weights`, FileNotFoundError as `read_weights`.
         """

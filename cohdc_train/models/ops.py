@@ -1,7 +1,7 @@
 """Operators that keep the detector exportable: every inner shape but one is known beforehand.
 
-The one is how many detections there are to segment. Each is an ordinary torch function wrapped as a custom operator;
-`cohdc_train.exporter.export` says what it is in ONNX.
+The one is how many detections there are to segment. Each is an ordinary torch function wrapped as a
+custom operator; `cohdc_train.exporter.export` says what it is in ONNX.
 """
 
 import torch
@@ -10,11 +10,16 @@ from torch import Tensor
 from torchvision.ops import nms, roi_align
 
 SAMPLING_RATIO = 2
-CANONICAL_SIDE, CANONICAL_LEVEL = 224, 4  # FPN's rule: a 224 px box is pooled from level 4 (stride 16)
+CANONICAL_SIDE, CANONICAL_LEVEL = (
+    224,
+    4,
+)  # FPN's rule: a 224 px box is pooled from level 4 (stride 16)
 
 
 def fitted_size(height: int, width: int, canvas: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) in px of an image fitted into the canvas, its aspect kept to the nearest pixel; integers only."""
+    """(height, width) in px of an image fitted into the canvas, its aspect kept to the nearest
+    pixel; integers only.
+    """
     rows, columns = canvas
     if rows * width <= columns * height:
         return rows, max(1, (2 * width * rows + height) // (2 * height))
@@ -25,14 +30,16 @@ def fitted_size(height: int, width: int, canvas: tuple[int, int]) -> tuple[int, 
 def letterbox(images: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
     """Resize images into the top left of a black canvas (bilinear, antialiased).
 
-    images: uint8 [B, H, W, 3]. Returns float32 [B, 3, rows, columns] in 0..1 and float32 [4]: height and width of the
-    content in canvas px, then image px per canvas px along y and x.
+    images: uint8 [B, H, W, 3]. Returns float32 [B, 3, rows, columns] in 0..1 and float32 [4]:
+    height and width of the content in canvas px, then image px per canvas px along y and x.
     """
     height, width = images.shape[1:3]
     size = fitted_size(height, width, (rows, columns))
     x = images.permute(0, 3, 1, 2).contiguous().float()
     x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True) / 255
-    geometry = torch.tensor([size[0], size[1], height / size[0], width / size[1]], device=images.device)
+    geometry = torch.tensor(
+        [size[0], size[1], height / size[0], width / size[1]], device=images.device
+    )
     return F.pad(x, (0, columns - size[1], 0, rows - size[0])).contiguous(), geometry
 
 
@@ -46,7 +53,8 @@ def _(images: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
 def nms_keep(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float) -> Tensor:
     """Greedy non-maximum suppression of each image by itself.
 
-    boxes: float32 [B, n, 4] xyxy; scores: float32 [B, n]. Returns bool [B, n]: kept, and scored above the threshold.
+    boxes: float32 [B, n, 4] xyxy; scores: float32 [B, n]. Returns bool [B, n]: kept, and scored
+    above the threshold.
     """
     if boxes.is_cuda:  # where every call waits for the device
         return nms_keep_at_once(boxes, scores, iou_threshold, score_threshold)
@@ -63,8 +71,12 @@ def _(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: floa
     return torch.empty_like(scores, dtype=torch.bool)
 
 
-def nms_keep_at_once(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float) -> Tensor:
-    """What `nms_keep` returns, in one suppression of all images, moved apart. No coordinate is below 0."""
+def nms_keep_at_once(
+    boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float
+) -> Tensor:
+    """What `nms_keep` returns, in one suppression of all images, moved apart. No coordinate is
+    below 0.
+    """
     keep = torch.zeros_like(scores, dtype=torch.bool)
     candidates = torch.nonzero(scores.flatten() > score_threshold)[:, 0]
     apart = (candidates // boxes.shape[1])[:, None] * (boxes.max() + 1)
@@ -74,11 +86,14 @@ def nms_keep_at_once(boxes: Tensor, scores: Tensor, iou_threshold: float, score_
 
 
 @torch.library.custom_op("cohdc::roi_pool_levels", mutates_args=())
-def roi_pool_levels(features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int) -> Tensor:
-    """RoIAlign of every box from the pyramid level that suits its size (FPN, eq. 1 of Lin et al. 2017).
+def roi_pool_levels(
+    features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int
+) -> Tensor:
+    """RoIAlign of every box from the pyramid level that suits its size (FPN, eq. 1 of Lin et al.
+    2017).
 
-    features: [B, C, H / s, W / s] for each stride s; boxes: float32 [R, 4] xyxy, canvas px; images: int64 [R], which
-    image each box is of. Returns [R, C, side, side].
+    features: [B, C, H / s, W / s] for each stride s; boxes: float32 [R, 4] xyxy, canvas px; images:
+    int64 [R], which image each box is of. Returns [R, C, side, side].
     """
     rois = torch.cat([images[:, None].to(boxes.dtype), boxes], dim=1)
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
@@ -89,19 +104,25 @@ def roi_pool_levels(features: list[Tensor], boxes: Tensor, images: Tensor, strid
     for i, feature in enumerate(features):
         chosen = torch.nonzero(level == i)[:, 0]
         # in float32: a bfloat16 coordinate above 256 px is off by up to 1 px
-        cells = roi_align(feature.float(), rois[chosen].float(), (side, side), 1.0 / strides[i], SAMPLING_RATIO)
+        cells = roi_align(
+            feature.float(), rois[chosen].float(), (side, side), 1.0 / strides[i], SAMPLING_RATIO
+        )
         pooled[chosen] = cells.to(feature.dtype)
     return pooled
 
 
 @roi_pool_levels.register_fake
-def _(features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int) -> Tensor:
+def _(
+    features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int
+) -> Tensor:
     return features[0].new_empty((boxes.shape[0], features[0].shape[1], side, side))
 
 
 @torch.library.custom_op("cohdc::rows_to_segment", mutates_args=())
 def rows_to_segment(present: Tensor) -> Tensor:
-    """Which rows of bool [R] are True, as int64 [K] rising. The first is always one of them, so that K is never 0."""
+    """Which rows of bool [R] are True, as int64 [K] rising. The first is always one of them, so
+    that K is never 0.
+    """
     wanted = present.clone()
     wanted[0] = True
     return torch.nonzero(wanted)[:, 0]

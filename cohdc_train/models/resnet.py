@@ -6,7 +6,15 @@ from typing import Literal
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
-from cohdc_train.models.backbone import Norm, Rates, StagedBackbone, load_weights, norm_layer, read_weights, rounded
+from cohdc_train.models.backbone import (
+    Norm,
+    Rates,
+    StagedBackbone,
+    load_weights,
+    norm_layer,
+    read_weights,
+    rounded,
+)
 
 Depth = Literal[18, 34, 50, 101]
 _BLOCKS: dict[int, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
@@ -18,16 +26,21 @@ _BLOCKS: dict[int, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, in
 
 
 class HDCResNet(StagedBackbone):
-    """ResNet whose 3x3 convolutions follow a dilation pattern inside each stage; strides stay 4, 8, 16, 32.
+    """ResNet whose 3x3 convolutions follow a dilation pattern inside each stage; strides stay 4, 8,
+    16, 32.
 
-    Dilation changes no tensor's shape, so ImageNet weights load unchanged. A stage's strided convolution keeps rate 1
-    and the pattern starts behind it: with the stride inside the pattern, (1, 2, 3) would skip every eighth pixel.
+    Dilation changes no tensor's shape, so ImageNet weights load unchanged. A stage's strided
+    convolution keeps rate 1 and the pattern starts behind it: with the stride inside the pattern,
+    (1, 2, 3) would skip every eighth pixel.
 
     Args:
         depth: 18, 34, 50 or 101.
-        width: channels as a share of ResNet's (64, 128, 256, 512 planes), rounded to multiples of 8.
-        rates: dilation pattern of each of the four stages, cycled over its convolutions; (1,) is a plain stage.
-        norm: "batch" trains BatchNorm, "frozen" keeps its statistics and scale (small batches, pretrained weights).
+        width: channels as a share of ResNet's (64, 128, 256, 512 planes), rounded to multiples of
+            8.
+        rates: dilation pattern of each of the four stages, cycled over its convolutions; (1,) is a
+            plain stage.
+        norm: "batch" trains BatchNorm, "frozen" keeps its statistics and scale (small batches,
+            pretrained weights).
         frozen_stages: how many of stem, layer1 .. layer4 are not trained, counted from the stem.
 
     Raises:
@@ -72,9 +85,9 @@ class HDCResNet(StagedBackbone):
     def load(self, weights: str) -> None:
         """Fill a full-width network with ImageNet weights.
 
-        weights: a torchvision name such as "IMAGENET1K_V1", or the path of a state dict (`fc.*` is passed over).
-        Raises ValueError naming the file and the first tensor that does not fit; FileNotFoundError when there is no
-        such file and no such name.
+        weights: a torchvision name such as "IMAGENET1K_V1", or the path of a state dict (`fc.*` is
+        passed over). Raises ValueError naming the file and the first tensor that does not fit;
+        FileNotFoundError when there is no such file and no such name.
         """
         state = read_weights(weights, f"resnet{self.depth}")
         load_weights(self, weights, state, f"ResNet-{self.depth}")
@@ -91,7 +104,9 @@ def _stage(
     out = planes * block.expansion
     shortcut = None
     if stride != 1 or channels != out:
-        shortcut = nn.Sequential(nn.Conv2d(channels, out, 1, stride=stride, bias=False), make_norm(out))
+        shortcut = nn.Sequential(
+            nn.Conv2d(channels, out, 1, stride=stride, bias=False), make_norm(out)
+        )
     first = block(channels, planes, stride, shortcut, norm_layer=make_norm)
     rest = [block(out, planes, norm_layer=make_norm) for _ in range(blocks - 1)]
     return nn.Sequential(first, *rest)

@@ -1,4 +1,6 @@
-"""The region proposal network: torchvision's, exact in mixed precision, blind to what crowds hide, batched."""
+"""The region proposal network: torchvision's, exact in mixed precision, blind to what crowds hide,
+batched.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,8 +20,8 @@ _CROWD_OVERLAP = 0.5  # share of a background anchor or proposal inside a crowd 
 class PreciseRPNHead(RPNHead):  # type: ignore[misc]  # torchvision is not typed
     """Torchvision's RPN head, whose outputs are float32 also in mixed precision.
 
-    Torchvision gives its proposals the type of the deltas: in bfloat16 they, and the true boxes that join them, would
-    lie on a grid of 2 px at the 300th pixel.
+    Torchvision gives its proposals the type of the deltas: in bfloat16 they, and the true boxes
+    that join them, would lie on a grid of 2 px at the 300th pixel.
     """
 
     def forward(self, x: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
@@ -30,8 +32,8 @@ class PreciseRPNHead(RPNHead):  # type: ignore[misc]  # torchvision is not typed
 class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
     """Torchvision's RPN, for which a background anchor inside a crowd box is no negative.
 
-    Anchors lie by the pyramid's strides. Torchvision divides the image by the map instead, which is another number
-    where the image was padded for it.
+    Anchors lie by the pyramid's strides. Torchvision divides the image by the map instead, which is
+    another number where the image was padded for it.
     """
 
     def __init__(self, finest_stride: int, *args: Any) -> None:
@@ -39,11 +41,17 @@ class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
         self.finest_stride = finest_stride
 
     def forward(
-        self, canvas: tuple[int, int], features: list[Tensor], targets: Sequence[Mapping[str, Any]], wanted: int
+        self,
+        canvas: tuple[int, int],
+        features: list[Tensor],
+        targets: Sequence[Mapping[str, Any]],
+        wanted: int,
     ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Proposals of each image [n, 4], canvas px, for training the heads, and the losses of objectness and boxes.
+        """Proposals of each image [n, 4], canvas px, for training the heads, and the losses of
+        objectness and boxes.
 
-        canvas: (height, width) px of the images; features: of the pyramid, finest first; wanted: proposals at most.
+        canvas: (height, width) px of the images; features: of the pyramid, finest first; wanted:
+        proposals at most.
         """
         objectness, deltas = self.head(features)
         height, width = canvas
@@ -51,7 +59,9 @@ class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
         with torch.no_grad():
             proposals = self.propose(objectness, deltas, wanted, limit)
             counts = is_solid(proposals).sum(dim=1).tolist()
-        anchors = [torch.cat([self.anchors(level, logits) for level, logits in enumerate(objectness)])] * len(targets)
+        anchors = [
+            torch.cat([self.anchors(level, logits) for level, logits in enumerate(objectness)])
+        ] * len(targets)
         labels, boxes = self.assign_targets_to_anchors(anchors, targets)
         goals = self.box_coder.encode(boxes, anchors)
         logits, shifts = (
@@ -61,26 +71,38 @@ class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
         losses: tuple[Tensor, Tensor] = self.compute_loss(logits, shifts, labels, goals)
         return [boxes[:count] for boxes, count in zip(proposals, counts, strict=True)], *losses
 
-    def propose(self, objectness: list[Tensor], deltas: list[Tensor], wanted: int, limit: Tensor) -> Tensor:
-        """[B, R, 4] the best proposals, R at most `wanted`, canvas px; rows without one are zero boxes, and last.
+    def propose(
+        self, objectness: list[Tensor], deltas: list[Tensor], wanted: int, limit: Tensor
+    ) -> Tensor:
+        """[B, R, 4] the best proposals, R at most `wanted`, canvas px; rows without one are zero
+        boxes, and last.
 
-        objectness, deltas: the head's maps; limit: [B, 1, 4], or [1, 1, 4] for all, what boxes are clipped to.
+        objectness, deltas: the head's maps; limit: [B, 1, 4], or [1, 1, 4] for all, what boxes are
+        clipped to.
         """
         boxes, scores = [], []
         for level, (logits, delta) in enumerate(zip(objectness, deltas, strict=True)):
-            score, index = _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
+            score, index = (
+                _flatten(logits, 1).squeeze(2).topk(min(2 * wanted, logits[0].numel()), dim=1)
+            )
             delta = _flatten(delta, 4).gather(1, index[:, :, None].expand(-1, -1, 4))
-            box = decode(delta.float(), self.anchors(level, logits, index), (1.0, 1.0, 1.0, 1.0), limit)
+            box = decode(
+                delta.float(), self.anchors(level, logits, index), (1.0, 1.0, 1.0, 1.0), limit
+            )
             score = torch.where(is_solid(box), score.float().sigmoid(), 0.0)
             score = torch.where(nms_keep(box, score, _NMS_IOU, 0.0), score, 0.0)
             boxes.append(box)
             scores.append(score)
-        score, index = torch.cat(scores, dim=1).topk(min(wanted, sum(s.shape[1] for s in scores)), dim=1)
+        score, index = torch.cat(scores, dim=1).topk(
+            min(wanted, sum(s.shape[1] for s in scores)), dim=1
+        )
         box = torch.cat(boxes, dim=1).gather(1, index[:, :, None].expand(-1, -1, 4))
         return box * (score > 0)[:, :, None]
 
     def anchors(self, level: int, logits: Tensor, index: Tensor | None = None) -> Tensor:
-        """[..., 4] a level's anchors at flat positions, or all; shapes count fastest, then columns, rows last."""
+        """[..., 4] a level's anchors at flat positions, or all; shapes count fastest, then columns,
+        rows last.
+        """
         cell = self.anchor_generator.cell_anchors[level].to(logits.device)
         index = torch.arange(logits[0].numel(), device=logits.device) if index is None else index
         stride, shapes, width = self.finest_stride * 2**level, cell.shape[0], logits.shape[3]
@@ -97,8 +119,12 @@ class CrowdAwareRPN(RegionProposalNetwork):  # type: ignore[misc]
         return labels, matched
 
 
-def build_rpn(channels: int, scales: Sequence[int], finest_stride: int, proposals: tuple[int, int]) -> CrowdAwareRPN:
-    """channels: of the pyramid; scales: px, one a level, in three aspects; proposals: in training and at inference."""
+def build_rpn(
+    channels: int, scales: Sequence[int], finest_stride: int, proposals: tuple[int, int]
+) -> CrowdAwareRPN:
+    """channels: of the pyramid; scales: px, one a level, in three aspects; proposals: in training
+    and at inference.
+    """
     anchors = AnchorGenerator(tuple((scale,) for scale in scales), ((0.5, 1.0, 2.0),) * len(scales))
     head = PreciseRPNHead(channels, anchors.num_anchors_per_location()[0])
     top = {"training": proposals[0], "testing": proposals[1]}
@@ -107,12 +133,16 @@ def build_rpn(channels: int, scales: Sequence[int], finest_stride: int, proposal
 
 
 def decode(deltas: Tensor, boxes: Tensor, weights: tuple[float, ...], limit: Tensor) -> Tensor:
-    """Box deltas [B, n, 4] applied to boxes [B, n, 4] and clipped to limit [B, 1, 4] (R-CNN's parametrisation)."""
+    """Box deltas [B, n, 4] applied to boxes [B, n, 4] and clipped to limit [B, 1, 4] (R-CNN's
+    parametrisation).
+    """
     size = boxes[:, :, 2:] - boxes[:, :, :2]
     centre = boxes[:, :, :2] + 0.5 * size
     shift = deltas * deltas.new_tensor([1.0 / weight for weight in weights])
     centre = centre + shift[:, :, :2] * size
-    half = 0.5 * torch.exp(shift[:, :, 2:].clamp(max=4.135)) * size  # at most 1000 / 16 times as large
+    half = (
+        0.5 * torch.exp(shift[:, :, 2:].clamp(max=4.135)) * size
+    )  # at most 1000 / 16 times as large
     corners = torch.cat([centre - half, centre + half], dim=2)
     return torch.minimum(corners.clamp(min=0.0), limit)
 

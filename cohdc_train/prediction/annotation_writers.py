@@ -29,7 +29,8 @@ _LABELME = "5.5.0"  # whose files these are like
 class Found(NamedTuple):
     """The objects of one picture, without its pixels.
 
-    name: the picture's file name; size: (height, width) px; found: the detections; outlines: polygons of each.
+    name: the picture's file name; size: (height, width) px; found: the detections; outlines:
+    polygons of each.
     """
 
     name: str
@@ -70,7 +71,9 @@ def open_format(
 
 
 def coco(seen: Sequence[Found], class_names: Sequence[str]) -> dict[str, Any]:
-    """A COCO dictionary; annotations have `score`, `quality`, `category` and `file_name` besides COCO's own fields."""
+    """A COCO dictionary; annotations have `score`, `quality`, `category` and `file_name` besides
+    COCO's own fields.
+    """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for image_id, one in enumerate(seen, start=1):
@@ -99,7 +102,10 @@ def _annotation(found: Detections, row: int, outline: list[Polygon]) -> dict[str
 
 
 def _trust(found: Detections, row: int) -> dict[str, float]:
-    return {"score": round(float(found.scores[row]), 5), "quality": round(float(found.quality[row]), 5)}
+    return {
+        "score": round(float(found.scores[row]), 5),
+        "quality": round(float(found.quality[row]), 5),
+    }
 
 
 def _area(ring: FloatArray) -> float:
@@ -109,8 +115,12 @@ def _area(ring: FloatArray) -> float:
 
 
 def _numbers(ring: FloatArray) -> list[float]:
-    """x, y, x, y, ... on the grid of a tenth of a pixel that outlines have; whole numbers without a point."""
-    return [int(value) if value == int(value) else value for value in ring.ravel().round(1).tolist()]
+    """x, y, x, y, ... on the grid of a tenth of a pixel that outlines have; whole numbers without a
+    point.
+    """
+    return [
+        int(value) if value == int(value) else value for value in ring.ravel().round(1).tolist()
+    ]
 
 
 class _Coco:
@@ -129,8 +139,8 @@ class _Coco:
 class _Labelme:
     """<name>.json per picture, and review.txt.
 
-    Parts of an object share a group; holes are joined to the outer ring. The picture is named relative to the folder;
-    frames are written beside their file.
+    Parts of an object share a group; holes are joined to the outer ring. The picture is named
+    relative to the folder; frames are written beside their file.
     """
 
     def __init__(
@@ -145,7 +155,9 @@ class _Labelme:
     def picture(self, picture: Picture, one: Found) -> None:
         file = self._out / f"{picture.stem}.json"
         if file.exists():
-            raise DataError(f"{file}: is there already, perhaps corrected by hand; give a new folder")
+            raise DataError(
+                f"{file}: is there already, perhaps corrected by hand; give a new folder"
+            )
         path = f"{picture.stem}.jpg"
         if picture.path is not None:
             path = Path(os.path.relpath(picture.path.resolve(), self._out.resolve())).as_posix()
@@ -153,7 +165,12 @@ class _Labelme:
             write_bytes(self._own.path(path), jpeg(picture.rgb))
         height, width = one.size
         content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
-        content |= {"imagePath": path, "imageData": None, "imageHeight": height, "imageWidth": width}
+        content |= {
+            "imagePath": path,
+            "imageData": None,
+            "imageHeight": height,
+            "imageWidth": width,
+        }
         write_text(self._own.path(file.name), json.dumps(content, indent=1))
 
     def _shapes(self, one: Found) -> list[dict[str, Any]]:
@@ -164,8 +181,14 @@ class _Labelme:
             for polygon in outline:
                 numbers = _numbers(polygon.keyhole())
                 shape: dict[str, Any] = {"label": self._names[int(one.found.labels[row])]}
-                shape["points"] = [list(pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
-                shape |= {"group_id": row if len(outline) > 1 else None, "shape_type": "polygon", "mask": None}
+                shape["points"] = [
+                    list(pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)
+                ]
+                shape |= {
+                    "group_id": row if len(outline) > 1 else None,
+                    "shape_type": "polygon",
+                    "mask": None,
+                }
                 shape["description"] = f"score {trust['score']:.2f} quality {trust['quality']:.2f}"
                 shape["flags"] = {"check": trust["quality"] < self._check}
                 shapes.append(shape)
@@ -176,18 +199,24 @@ class _Labelme:
         lines = [
             f"{one.name}: {count} of {len(one.outlines)} contours to check, the worst of quality "
             f"{one.found.quality.min():.2f}"
-            for count, one in sorted(todo, key=lambda entry: (-entry[0], entry[1].found.quality.min(initial=1)))
+            for count, one in sorted(
+                todo, key=lambda entry: (-entry[0], entry[1].found.quality.min(initial=1))
+            )
             if count
         ]
-        write_text(self._out / "review.txt", "\n".join([*lines, ""]) if lines else "no contour to check\n")
+        write_text(
+            self._out / "review.txt", "\n".join([*lines, ""]) if lines else "no contour to check\n"
+        )
 
 
 class _Yolo:
-    """labels/<name>.txt per picture and data.yaml: `class x y x y ...`, shares of the picture's width and height.
+    """labels/<name>.txt per picture and data.yaml: `class x y x y ...`, shares of the picture's
+    width and height.
 
-    An object is one line: holes and further parts are joined by bridges of no width. There is no place for score and
-    quality. data.yaml has the names only: for a training, labels/ goes beside the folder images/, and frames of a
-    video are written to images/ here. Labels belong to pictures by their stem, so that no two may have the same.
+    An object is one line: holes and further parts are joined by bridges of no width. There is no
+    place for score and quality. data.yaml has the names only: for a training, labels/ goes beside
+    the folder images/, and frames of a video are written to images/ here. Labels belong to pictures
+    by their stem, so that no two may have the same.
     """
 
     def __init__(self, out: Path, own: OwnFiles, class_names: tuple[str, ...]) -> None:
@@ -199,14 +228,23 @@ class _Yolo:
             (self._out / "images").mkdir(exist_ok=True)
             write_bytes(self._own.path(f"images/{picture.name}"), jpeg(picture.rgb))
         elif picture.stem != picture.path.stem:
-            raise DataError(f"{picture.path}: another image has this stem, and YOLO labels are found by it")
+            raise DataError(
+                f"{picture.path}: another image has this stem, and YOLO labels are found by it"
+            )
         height, width = one.size
         lines = []
         for label, outline in zip(one.found.labels.tolist(), one.outlines, strict=True):
             shares = (joined(outline) / (width, height)).ravel()
-            lines.append(" ".join([str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]))
+            lines.append(
+                " ".join(
+                    [str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]
+                )
+            )
         labels = self._own.path(f"labels/{picture.stem}.txt")
         write_text(labels, "".join(f"{line}\n" for line in lines))
 
     def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
-        write_text(self._out / "data.yaml", yaml.safe_dump({"names": dict(enumerate(self._names))}, sort_keys=False))
+        write_text(
+            self._out / "data.yaml",
+            yaml.safe_dump({"names": dict(enumerate(self._names))}, sort_keys=False),
+        )

@@ -23,8 +23,8 @@ _WEBCAM_FRAMES = 100
 class Picture(NamedTuple):
     """One image to look at.
 
-    name: its file name; stem: what files about it are called, no two alike; rgb: uint8 [H, W, 3]; path: its file, None
-    of a frame.
+    name: its file name; stem: what files about it are called, no two alike; rgb: uint8 [H, W, 3];
+    path: its file, None of a frame.
     """
 
     name: str
@@ -34,10 +34,12 @@ class Picture(NamedTuple):
 
 
 def read_pictures(source: Path, most: int | None = None) -> Iterator[Picture]:
-    """The images behind a path, read one at a time: a file, a folder (by name, not its subfolders), a video's frames or
-    those of the webcam of that number. most: how many at most; None is all, and 100 of a webcam.
+    """The images behind a path, read one at a time: a file, a folder (by name, not its subfolders),
+    a video's frames or those of the webcam of that number. most: how many at most; None is all, and
+    100 of a webcam.
 
-    Raises DataError at once when there is nothing to read, and on the way for an image that cannot be decoded.
+    Raises DataError at once when there is nothing to read, and on the way for an image that cannot
+    be decoded.
     """
     if most is not None and most < 1:
         raise DataError(f"frames is {most}; at least 1 is needed")
@@ -48,7 +50,11 @@ def read_pictures(source: Path, most: int | None = None) -> Iterator[Picture]:
 
 def _stored(source: Path) -> Iterator[Picture]:
     if source.is_dir():
-        files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file())
+        files = sorted(
+            file
+            for file in source.iterdir()
+            if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()
+        )
         if not files:
             raise DataError(f"{source}: holds no image ({' '.join(sorted(IMAGE_SUFFIXES))})")
         return _images(files)
@@ -65,7 +71,9 @@ def _images(files: list[Path]) -> Iterator[Picture]:
         rgb = read_rgb(file)
         if rgb is None:
             raise DataError(f"{file}: cannot be decoded as an image")
-        name = file.stem if stems[file.stem] == 1 else file.name  # a.jpg and a.png must not share a file
+        name = (
+            file.stem if stems[file.stem] == 1 else file.name
+        )  # a.jpg and a.png must not share a file
         yield Picture(file.name, name, rgb, file)
 
 

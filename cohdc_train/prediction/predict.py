@@ -1,4 +1,6 @@
-"""`cohdc predict`: images, folders, videos or a webcam through an ONNX -> overlays and annotation files (no torch)."""
+"""`cohdc predict`: images, folders, videos or a webcam through an ONNX -> overlays and annotation
+files (no torch).
+"""
 
 import time
 from collections.abc import Iterable
@@ -44,24 +46,25 @@ def predict(
 ) -> dict[str, Any]:
     """Find objects in an image, a folder of images, a video or a webcam's pictures.
 
-    Writes `<name>_overlay.jpg` per image (in overlays/ unless the format is coco) and the objects' polygons: one COCO
-    file (predictions.json), a labelme file per image, or YOLO-seg labels with their data.yaml. With labelme a person
-    corrects contours instead of drawing them: every shape has its score and quality, those to check come first, and
-    review.txt lists the images by what is to do. Returns the objects as a COCO dictionary, whatever was written.
-    Raises DataError for images that cannot be read and for a folder with labelme files, which may be somebody's work;
-    ContractError for a model that does not keep the contract. What was found before an image that cannot be read is
-    written all the same.
+    Writes `<name>_overlay.jpg` per image (in overlays/ unless the format is coco) and the objects'
+    polygons: one COCO file (predictions.json), a labelme file per image, or YOLO-seg labels with
+    their data.yaml. With labelme a person corrects contours instead of drawing them: every shape
+    has its score and quality, those to check come first, and review.txt lists the images by what is
+    to do. Returns the objects as a COCO dictionary, whatever was written. Raises DataError for
+    images that cannot be read and for a folder with labelme files, which may be somebody's work;
+    ContractError for a model that does not keep the contract. What was found before an image that
+    cannot be read is written all the same.
 
     Args:
         source: an image, a folder of images, a video, or a webcam's number such as 0.
-        model: ONNX file written by `cohdc export`, a foreign one that is known, or a shipped network's name: person,
-            person_s.
+        model: ONNX file written by `cohdc export`, a foreign one that is known, or a shipped
+            network's name: person, person_s.
         out: folder for the results.
         score: least class score that is kept.
         quality: least mask quality that is kept; without it nothing is dropped for its quality.
         format: coco, labelme or yolo.
-        contour: how outlines become polygons: bas_dp has the fewest vertices, bisection is the fastest; dp has a fixed
-            tolerance of 2 px and knows no floor.
+        contour: how outlines become polygons: bas_dp has the fewest vertices, bisection is the
+            fastest; dp has a fixed tolerance of 2 px and knows no floor.
         iou_floor: least IoU of a written polygon with its mask; 1 keeps every pixel.
         check_below: mask quality below which a contour is marked to be checked, in labelme files.
         threads: onnxruntime's threads; 0 leaves it to onnxruntime.
@@ -81,11 +84,20 @@ def predict(
     network = Segmenter(model, threads)
     started = time.perf_counter()
     result = predict_pictures(
-        pictures, network, out, (score, quality), iou_floor, contour=contour, format=format, check_below=check_below
+        pictures,
+        network,
+        out,
+        (score, quality),
+        iou_floor,
+        contour=contour,
+        format=format,
+        check_below=check_below,
     )
     seconds = time.perf_counter() - started
     images, objects = len(result["images"]), len(result["annotations"])
-    print(f"{objects} objects in {images} images, {1e3 * seconds / images:.0f} ms per image with drawing, in {out}")
+    print(
+        f"{objects} objects in {images} images, {1e3 * seconds / images:.0f} ms per image with drawing, in {out}"
+    )
     return result
 
 
@@ -100,10 +112,12 @@ def predict_pictures(
     format: Format = "coco",
     check_below: float = 0.7,
 ) -> dict[str, Any]:
-    """Overlays and annotation files of pictures, in `out`. least: (score, quality or None) that are kept.
+    """Overlays and annotation files of pictures, in `out`. least: (score, quality or None) that are
+    kept.
 
-    An object whose mask covers no pixel's centre has no outline and is left out. Returns the COCO dictionary.
-    Raises DataError when `out` holds files of these names that no former prediction wrote.
+    An object whose mask covers no pixel's centre has no outline and is left out. Returns the COCO
+    dictionary. Raises DataError when `out` holds files of these names that no former prediction
+    wrote.
     """
     # Apart from files that tools take for a data set.
     overlays = "" if format == "coco" else "overlays/"
@@ -132,7 +146,9 @@ def predict_pictures(
 
 
 def _outline(mask: NDArray[np.bool_], iou_floor: float, contour: Method) -> list[Polygon]:
-    """A mask's polygons; exact ones where a fixed tolerance leaves nothing. Empty for an empty mask."""
+    """A mask's polygons; exact ones where a fixed tolerance leaves nothing. Empty for an empty
+    mask.
+    """
     exact = trace(mask)
     return simplify(exact, iou_floor, contour) or exact
 

@@ -1,4 +1,6 @@
-"""A run's files -> one HTML page that needs nothing beside itself: pictures, plots and tables are inside it."""
+"""A run's files -> one HTML page that needs nothing beside itself: pictures, plots and tables are
+inside it.
+"""
 
 import base64
 import html
@@ -34,7 +36,9 @@ figure { margin: 0 } figcaption { color: #666; font-size: .85rem } img { max-wid
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the page: a title, the words of the head and of the rows. Raises ValueError for an uneven row."""
+    """A table of the page: a title, the words of the head and of the rows. Raises ValueError for an
+    uneven row.
+    """
 
     title: str
     head: Sequence[str]
@@ -42,21 +46,29 @@ class Table:
 
     def __post_init__(self) -> None:
         if any(len(row) != len(self.head) for row in self.rows):
-            raise ValueError(f"table {self.title!r}: a row has not the {len(self.head)} cells of its head")
+            raise ValueError(
+                f"table {self.title!r}: a row has not the {len(self.head)} cells of its head"
+            )
 
     def html(self) -> str:
         """The table as HTML, every word escaped."""
         head = "".join(f"<th>{html.escape(word)}</th>" for word in self.head)
         rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(word)}</td>" for word in row) + "</tr>\n" for row in self.rows
+            "<tr>" + "".join(f"<td>{html.escape(word)}</td>" for word in row) + "</tr>\n"
+            for row in self.rows
         )
-        return (
-            f"<h3>{html.escape(self.title)}</h3>\n<table><thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
-        )
+        return f"<h3>{html.escape(self.title)}</h3>\n<table><thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
 
 
-def report(run: Path, *, against: Path | None = None, groundtruth: Path | None = None, out: Path | None = None) -> Path:
-    """One HTML page of a SLAM run's scores, trajectory, times and pictures; nothing beside it is needed to read it.
+def report(
+    run: Path,
+    *,
+    against: Path | None = None,
+    groundtruth: Path | None = None,
+    out: Path | None = None,
+) -> Path:
+    """One HTML page of a SLAM run's scores, trajectory, times and pictures; nothing beside it is
+    needed to read it.
 
     Returns the page. Raises DataError naming a file of a run that cannot be used.
 
@@ -71,7 +83,11 @@ def report(run: Path, *, against: Path | None = None, groundtruth: Path | None =
         groundtruth = beside if beside.is_file() else None
         print("ground truth: " + (str(beside) if groundtruth else f"none, {beside} is not there"))
     name = run.resolve().name
-    runs = {name: run} if against is None else {f"{against.resolve().name}, against": against, name: run}
+    runs = (
+        {name: run}
+        if against is None
+        else {f"{against.resolve().name}, against": against, name: run}
+    )
     page = out if out is not None else run / "report.html"
     if page.is_dir():
         raise DataError(f"{page}: is a folder; --out names the page")
@@ -89,7 +105,9 @@ def _config(run: Path) -> dict[str, Any]:
     try:
         config = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise DataError(f"{file}: cannot be read; is {run} a folder of cohdc slam? ({error})") from error
+        raise DataError(
+            f"{file}: cannot be read; is {run} a folder of cohdc slam? ({error})"
+        ) from error
     return config if isinstance(config, dict) else {}
 
 
@@ -103,10 +121,11 @@ def write_report(
 ) -> None:
     """Write one self-contained HTML page about SLAM runs on a sequence.
 
-    out: the HTML file, written whole or not at all; groundtruth: TUM file, None where there is none; runs: label ->
-    folder written by `slam` (trajectory.txt, metrics.json, map.png, pictures/<stamp>_before.jpg and _after.jpg);
-    overlays: JPEG or PNG images of predicted masks; tables: shown first. Sections without content are left out.
-    Raises DataError naming a file of a run or an image that cannot be used.
+    out: the HTML file, written whole or not at all; groundtruth: TUM file, None where there is
+    none; runs: label -> folder written by `slam` (trajectory.txt, metrics.json, map.png,
+    pictures/<stamp>_before.jpg and _after.jpg);
+    overlays: JPEG or PNG images of predicted masks; tables: shown first. Sections without content
+    are left out. Raises DataError naming a file of a run or an image that cannot be used.
     """
     truth = None if groundtruth is None else read_tum(groundtruth)
     loaded = [_load(label, folder, truth) for label, folder in runs.items()]
@@ -120,18 +139,27 @@ def write_report(
     if aligned and truth is not None:
         parts.append("<h2>Absolute trajectory error over time</h2>")
         parts.append(
-            _svg(plot_errors(truth, aligned), "distance to ground truth of every matched pose, after alignment")
+            _svg(
+                plot_errors(truth, aligned),
+                "distance to ground truth of every matched pose, after alignment",
+            )
         )
-    maps = [(run.folder / "map.png", run.label) for run in loaded if (run.folder / "map.png").is_file()]
+    maps = [
+        (run.folder / "map.png", run.label) for run in loaded if (run.folder / "map.png").is_file()
+    ]
     if maps:
-        parts.append("<h2>Map from above</h2>\n<p>What stands still; the way of the camera in red.</p>")
+        parts.append(
+            "<h2>Map from above</h2>\n<p>What stands still; the way of the camera in red.</p>"
+        )
         parts.append(_grid(maps))
     if overlays:
         parts.append(f"<h2>Predicted masks</h2>\n{_grid([(file, file.stem) for file in overlays])}")
     pictures = [item for run in loaded for item in _pictures(run)]
     if pictures:
         parts.append("<h2>Features before and after culling</h2>")
-        parts.append("<p>Before: every corner, red on a mask. After: the corners that were used, masks outlined.</p>")
+        parts.append(
+            "<p>Before: every corner, red on a mask. After: the corners that were used, masks outlined.</p>"
+        )
         parts.append(_grid(pictures))
     _write(out, title, parts)
 
@@ -140,7 +168,10 @@ def _write(out: Path, title: str, parts: Sequence[str]) -> None:
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
     body = "\n".join([f"<h1>{html.escape(title)}</h1>", *parts])
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(out, f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n')
+    write_text(
+        out,
+        f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n',
+    )
 
 
 def _load(label: str, folder: Path, truth: Trajectory | None) -> Run:
@@ -173,7 +204,10 @@ def _metric_tables(runs: Sequence[Run]) -> list[Table]:
     result = []
     if scored:
         names = list(scored[0][1].metrics[scored[0][0]])
-        rows = [[key, run.label, *(f"{run.metrics[key][name]:.4f}" for name in names)] for key, run in scored]
+        rows = [
+            [key, run.label, *(f"{run.metrics[key][name]:.4f}" for name in names)]
+            for key, run in scored
+        ]
         result.append(Table("Trajectory scores", ["score", "run", *names], rows))
     rows = []
     for run in runs:
@@ -181,7 +215,13 @@ def _metric_tables(runs: Sequence[Run]) -> list[Table]:
         for stage, time in run.metrics.get("ms", {}).items():
             rows.append([run.label, coverage, stage, f"{time['p50']:.1f}", f"{time['p95']:.1f}"])
     if rows:
-        result.append(Table("Coverage and time per stage", ["run", "coverage", "stage", "p50 ms", "p95 ms"], rows))
+        result.append(
+            Table(
+                "Coverage and time per stage",
+                ["run", "coverage", "stage", "p50 ms", "p95 ms"],
+                rows,
+            )
+        )
     return result
 
 
@@ -203,7 +243,10 @@ def _pictures(run: Run) -> list[tuple[Path, str]]:
         after = before.with_name(before.name.replace("_before", "_after"))
         if after.is_file():  # a run without masks culls nothing
             stamp = before.name.removesuffix("_before.jpg")
-            files += [(before, f"{run.label}, {stamp}, before"), (after, f"{run.label}, {stamp}, after")]
+            files += [
+                (before, f"{run.label}, {stamp}, before"),
+                (after, f"{run.label}, {stamp}, after"),
+            ]
     return files
 
 

@@ -21,8 +21,8 @@ _LOST_AFTER_S = 0.5  # a longer pause between two poses is left open in a plot
 class Run:
     """One SLAM run.
 
-    truth, estimate: matched poses, the estimate aligned to the truth; None when too few matched. Without ground truth
-    the estimate stands as it is.
+    truth, estimate: matched poses, the estimate aligned to the truth; None when too few matched.
+    Without ground truth the estimate stands as it is.
     """
 
     label: str
@@ -39,7 +39,9 @@ def _figure(width: float, height: float) -> "Figure":
 
 
 def _opened(trajectory: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Stamps [n] and positions [n, 3] with a row of nan wherever tracking paused, so that no line is drawn there."""
+    """Stamps [n] and positions [n, 3] with a row of nan wherever tracking paused, so that no line
+    is drawn there.
+    """
     pauses = np.flatnonzero(np.diff(trajectory.stamps) > _LOST_AFTER_S) + 1
     stamps = np.insert(trajectory.stamps, pauses, np.nan)
     return stamps, np.insert(trajectory.positions, pauses, np.nan, axis=0)
@@ -93,7 +95,14 @@ def plot_errors(truth: Trajectory, runs: Sequence[Run]) -> "Figure":
             continue
         errors = np.linalg.norm(run.estimate.positions - run.truth.positions, axis=1)
         label = f"{run.label}: rmse {np.sqrt(np.mean(errors**2)):.4f} m"
-        axes.plot(run.truth.stamps - truth.stamps[0], np.maximum(errors, 1e-5), ".-", color=colour, ms=3, label=label)
+        axes.plot(
+            run.truth.stamps - truth.stamps[0],
+            np.maximum(errors, 1e-5),
+            ".-",
+            color=colour,
+            ms=3,
+            label=label,
+        )
     axes.set_yscale("log")  # a run with masks and one without differ by more than ten
     axes.set_xlabel("time [s]")
     axes.set_ylabel("error [m]")

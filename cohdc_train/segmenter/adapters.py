@@ -1,13 +1,16 @@
-"""Graphs of other exporters, recognised by their inputs and outputs and read as if they kept the contract.
+"""Graphs of other exporters, recognised by their inputs and outputs and read as if they kept the
+contract.
 
 | kind | input, RGB in 0..1 | outputs |
 |---|---|---|
-| `YoloSeg` | float [1, 3, S, S], letterboxed in the centre on grey | candidates, prototypes [1, P, h, w] |
-| `TorchvisionMaskRCNN` | float [3, H, W] | boxes [n, 4], labels [n] from 1, scores [n], masks [n, 1, H, W] |
+| `YoloSeg` | float [1, 3, S, S], letterboxed in the centre on grey | candidates, prototypes [1, P,
+h, w] |
+| `TorchvisionMaskRCNN` | float [3, H, W] | boxes [n, 4], labels [n] from 1, scores [n], masks [n,
+1, H, W] |
 
-Candidates are [1, 4 + C + P, n]: box cx, cy, w, h in canvas px, class scores, mask coefficients; or, of networks that
-suppress by themselves, [1, n, 6 + P]: box x0, y0, x1, y1, score, class, mask coefficients. Neither kind has a CQE head:
-quality is 1.
+Candidates are [1, 4 + C + P, n]: box cx, cy, w, h in canvas px, class scores, mask coefficients;
+or, of networks that suppress by themselves, [1, n, 6 + P]: box x0, y0, x1, y1, score, class, mask
+coefficients. Neither kind has a CQE head: quality is 1.
 """
 
 import ast
@@ -40,8 +43,12 @@ class YoloSeg:
         table, maps = _by_rank(session)
         self._outputs = [table.name, maps.name]
         self._suppressed = table.shape[2] == 6 + maps.shape[1]
-        self.class_names = _names(path, metadata, None if self._suppressed else table.shape[1] - 4 - maps.shape[1])
-        sides = [side if isinstance(side, int) else 640 for side in shape[2:]]  # a free size runs at the usual 640
+        self.class_names = _names(
+            path, metadata, None if self._suppressed else table.shape[1] - 4 - maps.shape[1]
+        )
+        sides = [
+            side if isinstance(side, int) else 640 for side in shape[2:]
+        ]  # a free size runs at the usual 640
         self.canvas: tuple[int, int] | None = (sides[0], sides[1])
 
     @staticmethod
@@ -62,7 +69,9 @@ class YoloSeg:
         blob = np.ascontiguousarray(fitted.transpose(2, 0, 1)[None]).astype(np.float32) / 255
         name = self._session.get_inputs()[0].name
         table, prototypes = (out[0] for out in self._session.run(self._outputs, {name: blob}))
-        boxes, labels, scores, coefficients = _last(table) if self._suppressed else _best(table, len(prototypes))
+        boxes, labels, scores, coefficients = (
+            _last(table) if self._suppressed else _best(table, len(prototypes))
+        )
         height, width = rgb.shape[:2]
         corner = np.array([left, top, left, top], np.float32)
         limit = np.array([width, height, width, height], np.float32)
@@ -110,7 +119,9 @@ class TorchvisionMaskRCNN:
         kept = kept[np.argsort(-scores[kept], kind="stable")][:MOST]
         masks = [_cut(maps[i], boxes[i]) for i in kept]
         in_image = boxes[kept] * np.array([width / columns, height / rows] * 2, np.float32)
-        return _detections(in_image, labels[kept] - 1, scores[kept], masks, (height, width), self.class_names)
+        return _detections(
+            in_image, labels[kept] - 1, scores[kept], masks, (height, width), self.class_names
+        )
 
 
 FOREIGN = (YoloSeg, TorchvisionMaskRCNN)
@@ -121,7 +132,9 @@ def _by_rank(session: Any) -> list[Any]:
 
 
 def _best(table: Floats, prototypes: int) -> tuple[NDArray[Any], ...]:
-    """Boxes xyxy in canvas px, labels, scores and coefficients of candidates [4 + C + P, n] behind suppression."""
+    """Boxes xyxy in canvas px, labels, scores and coefficients of candidates [4 + C + P, n] behind
+    suppression.
+    """
     centre, size, classes, coefficients = np.split(table, [2, 4, len(table) - prototypes])
     scores, labels = classes.max(axis=0), classes.argmax(axis=0)
     likely = np.flatnonzero(scores > SCORE_THRESHOLD)
@@ -135,7 +148,12 @@ def _best(table: Floats, prototypes: int) -> tuple[NDArray[Any], ...]:
     )
     rows = likely[np.asarray(chosen, dtype=np.int64).reshape(-1)]
     rows = rows[np.argsort(-scores[rows], kind="stable")][:MOST]
-    return np.concatenate([corner, corner + size])[:, rows].T, labels[rows], scores[rows], coefficients[:, rows].T
+    return (
+        np.concatenate([corner, corner + size])[:, rows].T,
+        labels[rows],
+        scores[rows],
+        coefficients[:, rows].T,
+    )
 
 
 def _last(table: Floats) -> tuple[NDArray[Any], ...]:
@@ -154,7 +172,9 @@ def _detections(
     names: tuple[str, ...],
 ) -> Detections:
     if len(labels) and labels.max() >= len(names):
-        raise ContractError(f"class {labels.max() + 1} of a foreign graph has no name; {len(names)} are given")
+        raise ContractError(
+            f"class {labels.max() + 1} of a foreign graph has no name; {len(names)} are given"
+        )
     cells = np.stack(masks) if masks else np.zeros((0, _ROI, _ROI), np.float32)
     return Detections(
         boxes.astype(np.float32).reshape(-1, 4),
@@ -168,7 +188,8 @@ def _detections(
 
 
 def _names(path: Path, metadata: dict[str, str], classes: int | None) -> tuple[str, ...]:
-    """Class names: of the metadata ("names", a list or {label: name}), of `<file>.txt`, or numbers from 1.
+    """Class names: of the metadata ("names", a list or {label: name}), of `<file>.txt`, or numbers
+    from 1.
 
     Raises ContractError when there are fewer than `classes`.
     """
@@ -176,9 +197,13 @@ def _names(path: Path, metadata: dict[str, str], classes: int | None) -> tuple[s
     if "names" in metadata:
         try:
             given = ast.literal_eval(metadata["names"])
-            names = [given[i] for i in range(len(given))] if isinstance(given, dict) else list(given)
+            names = (
+                [given[i] for i in range(len(given))] if isinstance(given, dict) else list(given)
+            )
         except (KeyError, SyntaxError, TypeError, ValueError) as error:
-            raise ContractError(f"{path}: its class names cannot be read: {metadata['names']:.40}") from error
+            raise ContractError(
+                f"{path}: its class names cannot be read: {metadata['names']:.40}"
+            ) from error
     elif listed.is_file():
         names = listed.read_text(encoding="utf-8").split("\n")
         names = names[:-1] if names[-1] == "" else names
@@ -190,19 +215,25 @@ def _names(path: Path, metadata: dict[str, str], classes: int | None) -> tuple[s
 
 
 def _letterbox(rgb: Image, canvas: tuple[int, int]) -> tuple[Image, float, tuple[int, int]]:
-    """An image in the centre of a grey canvas; canvas px per image px, and where its left and top edges lie."""
+    """An image in the centre of a grey canvas; canvas px per image px, and where its left and top
+    edges lie.
+    """
     rows, columns = canvas
     height, width = rgb.shape[:2]
     scale = min(rows / height, columns / width)
     inner = (max(1, round(width * scale)), max(1, round(height * scale)))
     left, top = round((columns - inner[0]) / 2 - 0.1), round((rows - inner[1]) / 2 - 0.1)
     fitted = np.full((rows, columns, 3), _GREY, np.uint8)
-    fitted[top : top + inner[1], left : left + inner[0]] = cv2.resize(rgb, inner, interpolation=cv2.INTER_LINEAR)
+    fitted[top : top + inner[1], left : left + inner[0]] = cv2.resize(
+        rgb, inner, interpolation=cv2.INTER_LINEAR
+    )
     return fitted, scale, (left, top)
 
 
 def _cut(field: Floats, box: NDArray[Any]) -> Floats:
-    """[_ROI, _ROI] of a map [h, w] inside a box, in the map's cells: sampled at the centres of a grid over it."""
+    """[_ROI, _ROI] of a map [h, w] inside a box, in the map's cells: sampled at the centres of a
+    grid over it.
+    """
     x0, y0, x1, y1 = (float(v) for v in box)
     centres = (np.arange(_ROI) + 0.5) / _ROI
     u = (x0 + centres * (x1 - x0) - 0.5).astype(np.float32)
@@ -210,7 +241,8 @@ def _cut(field: Floats, box: NDArray[Any]) -> Floats:
     grid_u, grid_v = np.meshgrid(u, v)
     field = np.ascontiguousarray(field, dtype=np.float32)
     return np.asarray(
-        cv2.remap(field, grid_u, grid_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32
+        cv2.remap(field, grid_u, grid_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        dtype=np.float32,
     )
 
 

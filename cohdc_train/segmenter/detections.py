@@ -16,7 +16,8 @@ class Detections:
         boxes: float32 [N, 4] xyxy, px of the image.
         labels: int64 [N], index into class_names.
         scores: float32 [N], class score.
-        quality: float32 [N], CQE's estimate of the mask's IoU with its object (1 where the network has no CQE head).
+        quality: float32 [N], CQE's estimate of the mask's IoU with its object (1 where the network
+            has no CQE head).
         roi_masks: float32 [N, M, M], probability inside the box.
         size: (height, width) of the image, px.
         class_names: name per label.
@@ -36,7 +37,11 @@ class Detections:
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} is {getattr(self, name).shape}, expected {shape}")
-        if self.roi_masks.ndim != 3 or len(self.roi_masks) != n or self.roi_masks.shape[1] != self.roi_masks.shape[2]:
+        if (
+            self.roi_masks.ndim != 3
+            or len(self.roi_masks) != n
+            or self.roi_masks.shape[1] != self.roi_masks.shape[2]
+        ):
             raise ValueError(f"roi_masks is {self.roi_masks.shape}, expected ({n}, M, M)")
 
     def __len__(self) -> int:
@@ -44,7 +49,13 @@ class Detections:
 
     def select(self, keep: NDArray[np.bool_]) -> "Detections":
         """The rows where keep [N] is True."""
-        rows = (self.boxes[keep], self.labels[keep], self.scores[keep], self.quality[keep], self.roi_masks[keep])
+        rows = (
+            self.boxes[keep],
+            self.labels[keep],
+            self.scores[keep],
+            self.quality[keep],
+            self.roi_masks[keep],
+        )
         return Detections(*rows, self.size, self.class_names)
 
     def masks(self, threshold: float = 0.5) -> NDArray[np.bool_]:

@@ -11,8 +11,8 @@ from cohdc_train.slam.geometry.se3 import Array
 
 @dataclass(frozen=True)
 class Pose:
-    """What became of one frame. t: s; T_wc: [4, 4] camera to world, m, None when the place is lost; track_ms: until it
-    was known; map_ms: of the work after that."""
+    """What became of one frame. t: s; T_wc: [4, 4] camera to world, m, None when the place is lost;
+    track_ms: until it was known; map_ms: of the work after that."""
 
     t: float
     T_wc: Array | None
@@ -32,8 +32,8 @@ PoseCallback = Callable[[Pose], None]
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One frame of a run. stamp: as rgb.txt writes it; culled: share of the pixels under the mask; segment_ms: time of
-    the mask; depth_ms: of the depth, where it was computed."""
+    """One frame of a run. stamp: as rgb.txt writes it; culled: share of the pixels under the mask;
+    segment_ms: time of the mask; depth_ms: of the depth, where it was computed."""
 
     stamp: str
     pose: Pose
@@ -46,9 +46,10 @@ class FrameRecord:
 class View:
     """One frame as the tracker takes it.
 
-    t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending, which a mask in a
-    folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical axis, 0 = no reading; depth_t: s, when
-    depth was taken, where that differs from t; depth_ms: what it took to compute.
+    t: s; stamp: t as text, as the source writes it; name: of the colour image without its ending,
+    which a mask in a folder bears too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] m along the optical
+    axis, 0 = no reading; depth_t: s, when depth was taken, where that differs from t; depth_ms:
+    what it took to compute.
     """
 
     t: float

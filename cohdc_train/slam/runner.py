@@ -23,10 +23,12 @@ from cohdc_train.slam.visualization.overlays import draw_after, draw_before, wri
 class RunObserver(Protocol):
     """Sees every frame of a run: the recorder of a cloud, a viewer, a robot's own publisher."""
 
-    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
-        """After a frame. mask: [H, W] bool, True = dynamic: what was masked, at rest or not, and what depth found to
-        move; None where there was neither. record.pose.T_wc: its pose; when record.pose.keyframe, the map's keyframe of
-        the time view.t is this frame."""
+    def __call__(
+        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
+        """After a frame. mask: [H, W] bool, True = dynamic: what was masked, at rest or not, and
+        what depth found to move; None where there was neither. record.pose.T_wc: its pose; when
+        record.pose.keyframe, the map's keyframe of the time view.t is this frame."""
         ...
 
 
@@ -50,10 +52,11 @@ def play(
     observers: Sequence[RunObserver],
     on_pose: PoseCallback | None = None,
 ) -> list[FrameRecord]:
-    """Track every view, call on_pose as soon as its pose is known, and the watchers when all is done with it; then draw
-    some into the new folder `pictures`.
+    """Track every view, call on_pose as soon as its pose is known, and the watchers when all is
+    done with it; then draw some into the new folder `pictures`.
 
-    Raises DataError for a view that cannot be used, unless the source is live and has given some, and when none comes.
+    Raises DataError for a view that cannot be used, unless the source is live and has given some,
+    and when none comes.
     """
     count = len(source)
     chosen = _pictured(count)
@@ -114,7 +117,9 @@ def _draw(picture: _Picture, extract: OrbExtractor, folder: Path) -> None:
 
 
 def _progress(done: int, count: int, record: FrameRecord) -> None:
-    """One line that renews itself on a terminal; elsewhere a line per tenth, or per hundred where no end is known."""
+    """One line that renews itself on a terminal; elsewhere a line per tenth, or per hundred where
+    no end is known.
+    """
     state = f"{record.pose.inliers} inliers" if record.pose.tracked else "lost"
     line = f"frame {done}/{count}  {state}" if count else f"frame {done}  {state}"
     if sys.stderr.isatty():

@@ -1,4 +1,6 @@
-"""Rendered data: COCO-format sets and TUM-format sequences of people walking in rooms. Importing it stays cheap."""
+"""Rendered data: COCO-format sets and TUM-format sequences of people walking in rooms. Importing it
+stays cheap.
+"""
 
 from cohdc_train.synth.coco import coco
 from cohdc_train.synth.sequence import sequence

@@ -13,7 +13,9 @@ from cohdc_train.synth.mesh import Floats, Mesh, yaw_rotation
 from cohdc_train.synth.textures import Texture
 from cohdc_train.synth.walk_paths import Walk
 
-_BLENDS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [1 / 3] * 3])
+_BLENDS = np.array(
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [1 / 3] * 3]
+)
 
 
 class Actor(Protocol):
@@ -127,12 +129,16 @@ class Thing:
 
 def _carried(points: Doubles, walk: Walk, frame: int) -> Doubles:
     """Points of a body where the walk has got to."""
-    carried: Doubles = points @ yaw_rotation(walk.heading[frame]).T + np.array([*walk.position[frame], 0.0])
+    carried: Doubles = points @ yaw_rotation(walk.heading[frame]).T + np.array(
+        [*walk.position[frame], 0.0]
+    )
     return carried
 
 
 def fastest(actor: Actor, frame: int, frames: int, rate: float) -> float:
-    """Speed of the fastest corner of `actor` between this frame and the next (the last two at the end), m/s."""
+    """Speed of the fastest corner of `actor` between this frame and the next (the last two at the
+    end), m/s.
+    """
     first = min(frame, frames - 2)
     step: Floats = actor.mesh(first + 1).corners - actor.mesh(first).corners
     return float(np.sqrt(np.square(step).sum(axis=2).max())) * rate

@@ -10,7 +10,9 @@ CameraMotion = Literal["xyz", "halfsphere", "static", "rpy", "loop"]
 MOTIONS: tuple[str, ...] = get_args(CameraMotion)
 _LOOP_RADIUS = 0.7  # m
 _LOOP_START, _LOOP_END = 0.03, 0.9  # parts of the time between which the camera turns
-_LEVEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # optical axes (right, down, forward) as columns, looking at +y
+_LEVEL = np.array(
+    [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+)  # optical axes (right, down, forward) as columns, looking at +y
 
 
 def sway(rng: np.random.Generator, times: Doubles, amplitude: float, period: float) -> Doubles:
@@ -18,16 +20,22 @@ def sway(rng: np.random.Generator, times: Doubles, amplitude: float, period: flo
     first, second = rng.uniform(0, 2 * np.pi, 2)
     period = period * rng.uniform(0.9, 1.1)
     slow, fast = 2 * np.pi / period, 2 * np.pi / (0.37 * period)
-    swing: Doubles = amplitude * (0.9 * np.sin(slow * times + first) + 0.1 * np.sin(fast * times + second))
+    swing: Doubles = amplitude * (
+        0.9 * np.sin(slow * times + first) + 0.1 * np.sin(fast * times + second)
+    )
     return swing
 
 
-def camera_path(rng: np.random.Generator, times: Doubles, motion: CameraMotion, eye: Doubles) -> Doubles:
-    """[n, 4, 4] T_wc at `times` [n] s, about `eye` [3] m: TUM's four hand motions, and a round of the room.
+def camera_path(
+    rng: np.random.Generator, times: Doubles, motion: CameraMotion, eye: Doubles
+) -> Doubles:
+    """[n, 4, 4] T_wc at `times` [n] s, about `eye` [3] m: TUM's four hand motions, and a round of
+    the room.
 
-    xyz: +-0.3 m along each axis, angles within 3 degrees; halfsphere: half a sphere of 0.5 m radius, looking at its
-    front; static: a hand's tremor; rpy: +-15 degrees about each axis almost on the spot; loop: once round a circle of
-    0.7 m radius about `eye`, looking outwards, back where it began for the last tenth of the time.
+    xyz: +-0.3 m along each axis, angles within 3 degrees; halfsphere: half a sphere of 0.5 m
+    radius, looking at its front; static: a hand's tremor; rpy: +-15 degrees about each axis almost
+    on the spot; loop: once round a circle of 0.7 m radius about `eye`, looking outwards, back where
+    it began for the last tenth of the time.
     """
     reach = {"xyz": 0.3, "halfsphere": 0.03, "static": 0.004, "rpy": 0.02, "loop": 0.03}[motion]
     angle = {"xyz": 3.0, "halfsphere": 2.0, "static": 0.3, "rpy": 15.0, "loop": 2.0}[motion]
@@ -39,7 +47,12 @@ def camera_path(rng: np.random.Generator, times: Doubles, motion: CameraMotion, 
             np.radians(30) + sway(rng, times, np.radians(25), 5.0),
         )
         ball = np.stack(
-            [np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], 1
+            [
+                np.sin(azimuth) * np.cos(elevation),
+                -np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ],
+            1,
         )
         shift = shift + 0.5 * (ball - np.array([0, -1, 0.5]))
         turn[:, 1] -= np.arctan2(shift[:, 0], 3.0)
@@ -56,7 +69,9 @@ def camera_path(rng: np.random.Generator, times: Doubles, motion: CameraMotion, 
 
 
 def loop_heading(times: Doubles) -> Doubles:
-    """[n] rad to the right of +y that the camera of a loop has turned to at `times`: 0 .. 2 pi, slow at both ends."""
+    """[n] rad to the right of +y that the camera of a loop has turned to at `times`: 0 .. 2 pi,
+    slow at both ends.
+    """
     done = np.clip((times / times[-1] - _LOOP_START) / (_LOOP_END - _LOOP_START), 0, 1)
     turned: Doubles = 2 * np.pi * done - 0.6 * np.sin(2 * np.pi * done)
     return turned

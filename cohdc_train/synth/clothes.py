@@ -16,7 +16,9 @@ def _folds(image: Floats, rng: np.random.Generator, depth: float) -> Texture:
 
 
 def cloth(rng: np.random.Generator, patterned: float) -> Texture:
-    """[128, 128, 3] a garment; `patterned` is the chance of stripes, checks, dots or a print instead of one colour."""
+    """[128, 128, 3] a garment; `patterned` is the chance of stripes, checks, dots or a print
+    instead of one colour.
+    """
     image = flat(SIDE, SIDE, colour(rng, 15, 235))
     if rng.random() < patterned:
         pattern = (_stripes, _checks, _dots, _print)[int(rng.integers(4))]
@@ -60,8 +62,13 @@ def _print(image: Floats, rng: np.random.Generator) -> None:
 
 def skin_tone(rng: np.random.Generator) -> Floats:
     """[3] RGB between dark and light skin."""
-    light, dark = np.array([236, 196, 170], dtype=np.float32), np.array([84, 54, 38], dtype=np.float32)
-    return np.clip(dark + (light - dark) * rng.beta(1.6, 1.0) + rng.normal(0, 5, 3), 0, 255).astype(np.float32)
+    light, dark = (
+        np.array([236, 196, 170], dtype=np.float32),
+        np.array([84, 54, 38], dtype=np.float32),
+    )
+    return np.clip(dark + (light - dark) * rng.beta(1.6, 1.0) + rng.normal(0, 5, 3), 0, 255).astype(
+        np.float32
+    )
 
 
 def skin(rng: np.random.Generator, tone: Floats) -> Texture:
@@ -70,7 +77,9 @@ def skin(rng: np.random.Generator, tone: Floats) -> Texture:
 
 
 def face(rng: np.random.Generator, tone: Floats, hair: Floats) -> Texture:
-    """[128, 128, 3] the head's texture; the face looks out at u = 0.5, eyes at v = 0.46, mouth at v = 0.66."""
+    """[128, 128, 3] the head's texture; the face looks out at u = 0.5, eyes at v = 0.46, mouth at v
+    = 0.66.
+    """
     image = flat(SIDE, SIDE, tone)
     centre = SIDE // 2
     brow = tuple(float(v) for v in hair * 0.7)
@@ -98,6 +107,10 @@ def hair(rng: np.random.Generator, rgb: Floats) -> Texture:
 
 def hair_colour(rng: np.random.Generator) -> Floats:
     """[3] RGB: black, brown, blond, red or grey."""
-    known = np.array([[22, 18, 16], [58, 38, 26], [96, 64, 40], [178, 142, 88], [120, 58, 30], [150, 148, 145]])
-    rgb: Floats = np.clip(known[int(rng.integers(len(known)))] + rng.normal(0, 8, 3), 5, 230).astype(np.float32)
+    known = np.array(
+        [[22, 18, 16], [58, 38, 26], [96, 64, 40], [178, 142, 88], [120, 58, 30], [150, 148, 145]]
+    )
+    rgb: Floats = np.clip(
+        known[int(rng.integers(len(known)))] + rng.normal(0, 8, 3), 5, 230
+    ).astype(np.float32)
     return rgb

@@ -21,16 +21,23 @@ from cohdc_train.synth.sensor import exposure, photograph, smear
 
 IMAGES_PER_ROOM = 5
 PEOPLE_PER_ROOM = 3
-SMALLEST_SHARE = 1 / 200  # of the image's pixels; a smaller visible part of a person is annotated as a crowd: ignored
+SMALLEST_SHARE = (
+    1 / 200
+)  # of the image's pixels; a smaller visible part of a person is annotated as a crowd: ignored
 SUPERSAMPLING = 1.5
-NEAREST, FARTHEST = 0.35, 6.0  # m: nearer, the camera would stand in a person; further, people outside of the room
+NEAREST, FARTHEST = (
+    0.35,
+    6.0,
+)  # m: nearer, the camera would stand in a person; further, people outside of the room
 DISTANCE = (0.7, 3.7)  # m, of people from the camera
 _COUNT_CHANCE = (0.08, 0.42, 0.34, 0.16)  # of 0, 1, .. 3 people
 
 
 @dataclass(frozen=True)
 class Picture:
-    """image: [H, W, 3] uint8 RGB; masks: [n, H, W] bool, the visible part of every person who has one."""
+    """image: [H, W, 3] uint8 RGB; masks: [n, H, W] bool, the visible part of every person who has
+    one.
+    """
 
     image: NDArray[np.uint8]
     masks: NDArray[np.bool_]
@@ -47,7 +54,11 @@ class Stage:
 
 def draw_stage(rng: np.random.Generator, detail: int) -> Stage:
     """A room of its own and three people; detail as in `furnished_room`."""
-    size = (float(rng.uniform(4.5, 7.5)), float(rng.uniform(4.5, 7.0)), float(rng.uniform(2.4, 3.0)))
+    size = (
+        float(rng.uniform(4.5, 7.5)),
+        float(rng.uniform(4.5, 7.0)),
+        float(rng.uniform(2.4, 3.0)),
+    )
     room = furnished_room(rng, size, float(rng.uniform(1.8, size[1] - 1.3)), detail)
     people = tuple(bodies.draw_person(rng) for _ in range(PEOPLE_PER_ROOM))
     atlas = Atlas([*room.textures, *(look for person in people for look in person.textures)])
@@ -55,16 +66,23 @@ def draw_stage(rng: np.random.Generator, detail: int) -> Stage:
 
 
 def take_picture(
-    stage: Stage, rng: np.random.Generator, size: tuple[int, int], distance: tuple[float, float] = DISTANCE
+    stage: Stage,
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    distance: tuple[float, float] = DISTANCE,
 ) -> Picture:
-    """One picture by a hand-held camera somewhere in the room. size: (height, width), px; distance: of people, m."""
+    """One picture by a hand-held camera somewhere in the room. size: (height, width), px; distance:
+    of people, m.
+    """
     camera = Camera.freiburg3(size).resized(SUPERSAMPLING)
     T_wc = _camera_pose(stage.room, rng)
     room = stage.room
     meshes = [room.mesh]
     for k, place in enumerate(_places(room, rng, T_wc, distance)):
         person = stage.people[k]
-        body = bodies.person_mesh(person, bodies.draw_pose(rng), place, float(rng.uniform(0, 2 * np.pi)))
+        body = bodies.person_mesh(
+            person, bodies.draw_pose(rng), place, float(rng.uniform(0, 2 * np.pi))
+        )
         meshes.append(body.named(k + 1, len(room.textures) + 6 * k))
     view = render(join(meshes), stage.atlas, _relit(room.lighting, rng), camera, T_wc)
     return Picture(_developed(view.rgb, rng, size), _visible(view.instance, size))
@@ -99,8 +117,14 @@ def _places(
     for _ in range(40 * wanted):
         if len(found) == wanted:
             break
-        distance, angle = nearest + (farthest - nearest) * rng.beta(1.3, 1.6), forward + rng.uniform(-0.6, 0.6)
-        x, y = float(T_wc[0, 3] + distance * np.cos(angle)), float(T_wc[1, 3] + distance * np.sin(angle))
+        distance, angle = (
+            nearest + (farthest - nearest) * rng.beta(1.3, 1.6),
+            forward + rng.uniform(-0.6, 0.6),
+        )
+        x, y = (
+            float(T_wc[0, 3] + distance * np.cos(angle)),
+            float(T_wc[1, 3] + distance * np.sin(angle)),
+        )
         apart = all(np.hypot(x - a, y - b) > 0.5 for a, b in found)
         if apart and room.is_free(x, y, 0.25):
             found.append((x, y))
@@ -115,11 +139,15 @@ def _relit(lighting: Lighting, rng: np.random.Generator) -> Lighting:
 
 
 def _developed(rgb: Floats, rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """The supersampled rendering as a photograph of `size`: exposure, motion blur in a third, optics, noise."""
+    """The supersampled rendering as a photograph of `size`: exposure, motion blur in a third,
+    optics, noise.
+    """
     rgb = np.minimum(rgb * np.float32(exposure(rgb, 0.4 * float(np.exp(rng.normal(0, 0.25))))), 1)
     scale = size[1] / 256
     if rng.random() < 0.33:
-        rgb = smear(rgb, SUPERSAMPLING * scale * float(rng.uniform(1.5, 6)), float(rng.uniform(0, np.pi)))
+        rgb = smear(
+            rgb, SUPERSAMPLING * scale * float(rng.uniform(1.5, 6)), float(rng.uniform(0, np.pi))
+        )
     small = cv2.resize(rgb, (size[1], size[0]), interpolation=cv2.INTER_AREA).astype(np.float32)
     return photograph(small, rng, float(rng.uniform(0.5, 3.5)), float(rng.uniform(0, 0.5)))
 
@@ -129,7 +157,9 @@ def _visible(instance: NDArray[np.int32], size: tuple[int, int]) -> NDArray[np.b
     masks = []
     free = np.ones(size, dtype=np.bool_)
     for k in range(1, int(instance.max(initial=0)) + 1):
-        cover = cv2.resize((instance == k).astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_AREA)
+        cover = cv2.resize(
+            (instance == k).astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_AREA
+        )
         mask = (cover >= 0.5) & free
         free &= ~mask
         if mask.any():
@@ -145,7 +175,8 @@ def coco(
     seed: int = 0,
     distance: tuple[float, float] = DISTANCE,
 ) -> None:
-    """Render a COCO-format folder of people in rooms: images/, instances_train.json, instances_val.json.
+    """Render a COCO-format folder of people in rooms: images/, instances_train.json,
+    instances_val.json.
 
     No room, garment or body of one split occurs in the other or in a sequence.
 
@@ -155,7 +186,8 @@ def coco(
         val: number of validation images.
         size: height and width of the images, px; at least 48 each.
         seed: same seed, same bytes.
-        distance: nearest and farthest that people stand from the camera, m; below 0.6 one may fill the picture.
+        distance: nearest and farthest that people stand from the camera, m; below 0.6 one may fill
+            the picture.
     """
     _check(train, val, size, seed, distance)
     with new_folder(out) as draft:
@@ -168,12 +200,16 @@ def coco(
     print(f"{out}: {train} + {val} images with {counts['train']} + {counts['val']} people")
 
 
-def _check(train: int, val: int, size: tuple[int, int], seed: int, distance: tuple[float, float]) -> None:
+def _check(
+    train: int, val: int, size: tuple[int, int], seed: int, distance: tuple[float, float]
+) -> None:
     for name, number in (("train", train), ("val", val)):
         if number < 1:
             raise DataError(f"{name}: {number} images; a split has at least 1")
     if min(size) < 48:
-        raise DataError(f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48")
+        raise DataError(
+            f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48"
+        )
     if seed < 0:
         raise DataError(f"seed: {seed} is negative")
     if not NEAREST <= distance[0] <= distance[1] <= FARTHEST:
@@ -183,7 +219,12 @@ def _check(train: int, val: int, size: tuple[int, int], seed: int, distance: tup
 
 
 def _render_split(
-    folder: Path, split: str, number: int, size: tuple[int, int], seed: int, distance: tuple[float, float]
+    folder: Path,
+    split: str,
+    number: int,
+    size: tuple[int, int],
+    seed: int,
+    distance: tuple[float, float],
 ) -> dict[str, Any]:
     """Write one split's images; returns its COCO document."""
     images: list[dict[str, Any]] = []
@@ -208,5 +249,7 @@ def _render_split(
 
 
 def _write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
-    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]):
+    if not cv2.imwrite(
+        str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]
+    ):
         raise DataError(f"{path}: cannot be written")

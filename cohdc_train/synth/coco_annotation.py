@@ -1,4 +1,6 @@
-"""Masks -> COCO annotations, in numpy and OpenCV: outlines along pixel borders, run lengths where there are holes."""
+"""Masks -> COCO annotations, in numpy and OpenCV: outlines along pixel borders, run lengths where
+there are holes.
+"""
 
 from typing import Any
 
@@ -18,10 +20,12 @@ def run_lengths(mask: Mask) -> dict[str, list[int]]:
 
 
 def outlines(mask: Mask) -> list[list[float]] | None:
-    """Polygons [x0, y0, x1, y1, ...] along the borders of the pixels, one per part; None when a part has a hole.
+    """Polygons [x0, y0, x1, y1, ...] along the borders of the pixels, one per part; None when a
+    part has a hole.
 
-    mask: [H, W]. Every pixel is enlarged to 3 x 3, so that OpenCV's contour, which runs through pixel centres, lies
-    within half a pixel of the border it stands for and rounds to it: the polygon covers exactly the mask.
+    mask: [H, W]. Every pixel is enlarged to 3 x 3, so that OpenCV's contour, which runs through
+    pixel centres, lies within half a pixel of the border it stands for and rounds to it: the
+    polygon covers exactly the mask.
     """
     count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     polygons: list[list[float]] = []
@@ -37,7 +41,9 @@ def outlines(mask: Mask) -> list[list[float]] | None:
 
 
 def annotate(mask: Mask, image_id: int, annotation_id: int, crowd: bool = False) -> dict[str, Any]:
-    """The COCO annotation of one visible person. mask: [H, W], not empty; a crowd is ignored by losses and scores."""
+    """The COCO annotation of one visible person. mask: [H, W], not empty; a crowd is ignored by
+    losses and scores.
+    """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     left, top = int(columns[0]), int(rows[0])
     polygons = None if crowd else outlines(mask)

@@ -1,4 +1,6 @@
-"""Things that people use: a chair to sit on, a loaded cart to push. Own frame as a person's: x forward, z up, m."""
+"""Things that people use: a chair to sit on, a loaded cart to push. Own frame as a person's: x
+forward, z up, m.
+"""
 
 import numpy as np
 
@@ -29,19 +31,37 @@ def chair_texture(rng: np.random.Generator) -> Texture:
 
 
 def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
-    """A cart of 1 x .6 m with a handle at its back, loaded to a height of 1.2-1.5 m, and its textures."""
-    looks = (_metal(rng), carton(rng, _SIDE, _SIDE), poster(rng, _SIDE, _SIDE), carton(rng, _SIDE, _SIDE))
+    """A cart of 1 x .6 m with a handle at its back, loaded to a height of 1.2-1.5 m, and its
+    textures.
+    """
+    looks = (
+        _metal(rng),
+        carton(rng, _SIDE, _SIDE),
+        poster(rng, _SIDE, _SIDE),
+        carton(rng, _SIDE, _SIDE),
+    )
     parts = [solids.box((0, 0, 0.2), (1.0, 0.6, 0.05), 0, 0, 0)]
     for x in (-0.4, 0.4):
         parts += [
-            solids.capsule((x, y - 0.02, 0.09), (x, y + 0.02, 0.09), (0.08, 0.08), _UPRIGHT, 0) for y in (-0.25, 0.25)
+            solids.capsule((x, y - 0.02, 0.09), (x, y + 0.02, 0.09), (0.08, 0.08), _UPRIGHT, 0)
+            for y in (-0.25, 0.25)
         ]
     parts += [solids.box((HANDLE, y, 0.62), (0.04, 0.04, 0.84), 0, 0, 0) for y in (-0.27, 0.27)]
     parts.append(solids.box((HANDLE, 0, 1.04), (0.04, 0.58, 0.04), 0, 0, 0))
     low, high = float(rng.uniform(0.55, 0.65)), float(rng.uniform(0.45, 0.58))
-    parts.append(solids.box((0.02, 0, 0.225 + low / 2), (0.86, 0.54, low), float(rng.normal(0, 0.02)), 1, 1))
-    parts.append(solids.box((0.2, 0, 0.225 + low + high / 2), (0.42, 0.46, high), float(rng.normal(0, 0.1)), 2, 3))
-    parts.append(solids.box((-0.2, 0.05, 0.225 + low + 0.11), (0.3, 0.34, 0.22), float(rng.normal(0, 0.1)), 3, 1))
+    parts.append(
+        solids.box((0.02, 0, 0.225 + low / 2), (0.86, 0.54, low), float(rng.normal(0, 0.02)), 1, 1)
+    )
+    parts.append(
+        solids.box(
+            (0.2, 0, 0.225 + low + high / 2), (0.42, 0.46, high), float(rng.normal(0, 0.1)), 2, 3
+        )
+    )
+    parts.append(
+        solids.box(
+            (-0.2, 0.05, 0.225 + low + 0.11), (0.3, 0.34, 0.22), float(rng.normal(0, 0.1)), 3, 1
+        )
+    )
     return solids.join(parts), looks
 
 

@@ -1,4 +1,6 @@
-"""Triangles with normals, texture coordinates and instance numbers, and the few solids rooms and people are made of."""
+"""Triangles with normals, texture coordinates and instance numbers, and the few solids rooms and
+people are made of.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +16,10 @@ Floats = NDArray[np.float32]
 class Mesh:
     """T triangles, nothing shared between them.
 
-    corners, normals: [T, 3, 3] m and unit vectors, one frame; uv: [T, 3, 2] in 0..1, v downwards in the texture;
-    texture: [T] int32 index into a list of textures; instance: [T] int32, 0 = room, 1.. = whoever is in it.
+    corners, normals: [T, 3, 3] m and unit vectors, one frame; uv: [T, 3, 2] in 0..1, v downwards in
+    the texture;
+    texture: [T] int32 index into a list of textures; instance: [T] int32, 0 = room, 1.. = whoever
+    is in it.
     """
 
     corners: Floats
@@ -29,10 +33,14 @@ class Mesh:
         turn = np.asarray(rotation, dtype=np.float32).T
         shift = np.asarray(translation, dtype=np.float32)
         corners = (self.corners.reshape(-1, 3) @ turn + shift).reshape(-1, 3, 3)
-        return replace(self, corners=corners, normals=(self.normals.reshape(-1, 3) @ turn).reshape(-1, 3, 3))
+        return replace(
+            self, corners=corners, normals=(self.normals.reshape(-1, 3) @ turn).reshape(-1, 3, 3)
+        )
 
     def named(self, instance: int, first_texture: int) -> "Mesh":
-        """The mesh as instance number `instance`, its textures starting at `first_texture` of a longer list."""
+        """The mesh as instance number `instance`, its textures starting at `first_texture` of a
+        longer list.
+        """
         return replace(
             self,
             instance=np.full_like(self.instance, instance),
@@ -60,9 +68,9 @@ def yaw_rotation(yaw: float) -> Floats:
 def grid(points: Floats, texture: int, closed: bool) -> Mesh:
     """The surface through a grid of points, smooth normals.
 
-    points: [R, S, 3] m. closed: the last column meets the first (a tube); uv then runs once around along u.
-    Normals of a closed surface point away from the line through the rings' centres, those of an open one to where u is
-    seen running to the right and v down.
+    points: [R, S, 3] m. closed: the last column meets the first (a tube); uv then runs once around
+    along u. Normals of a closed surface point away from the line through the rings' centres, those
+    of an open one to where u is seen running to the right and v down.
     """
     ring = np.concatenate([points, points[:, :1]], axis=1) if closed else points
     faces, uv = _topology(ring.shape[0], ring.shape[1])
@@ -93,13 +101,17 @@ def _topology(rows: int, columns: int) -> tuple[NDArray[np.int64], Floats]:
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    faces = np.concatenate(
+        [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)]
+    )
     return faces, np.stack([u, v], -1).reshape(-1, 2)[faces].astype(np.float32)
 
 
 def _unit(vectors: Floats) -> Floats:
     """[n, 3] scaled to length 1."""
-    scaled: Floats = vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
+    scaled: Floats = (
+        vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
+    )
     return scaled
 
 
@@ -115,13 +127,19 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def quad(origin: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, texture: int) -> Mesh:
-    """A parallelogram from `origin` [3] m along `edge_u` (u 0..1) and `edge_v` (v 0..1), facing as `grid` says."""
+    """A parallelogram from `origin` [3] m along `edge_u` (u 0..1) and `edge_v` (v 0..1), facing as
+    `grid` says.
+    """
     o, a, b = (np.asarray(p, dtype=np.float32) for p in (origin, edge_u, edge_v))
-    return grid(np.stack([np.stack([o, o + a]), np.stack([o + b, o + a + b])]), texture, closed=False)
+    return grid(
+        np.stack([np.stack([o, o + a]), np.stack([o + b, o + a + b])]), texture, closed=False
+    )
 
 
 def box(centre: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> Mesh:
-    """A box turned by `yaw` rad about z; `centre` [3] and `size` [3] m; textures of its sides and of its top."""
+    """A box turned by `yaw` rad about z; `centre` [3] and `size` [3] m; textures of its sides and
+    of its top.
+    """
     x, y, z = (float(v) / 2 for v in np.asarray(size, dtype=np.float32))
     faces = [
         quad((-x, -y, z), (2 * x, 0, 0), (0, 0, -2 * z), side),
@@ -152,14 +170,22 @@ def tube(centres: Floats, radii: Floats, side: ArrayLike, texture: int, segments
     return grid((centres[:, None] + offsets).astype(np.float32), texture, closed=True)
 
 
-def capsule(start: ArrayLike, end: ArrayLike, radii: tuple[float, float], side: ArrayLike, texture: int) -> Mesh:
-    """A limb: a tapered tube with round ends from `start` to `end` [3] m, a little fuller in its upper middle."""
+def capsule(
+    start: ArrayLike, end: ArrayLike, radii: tuple[float, float], side: ArrayLike, texture: int
+) -> Mesh:
+    """A limb: a tapered tube with round ends from `start` to `end` [3] m, a little fuller in its
+    upper middle.
+    """
     a, b = np.asarray(start, dtype=np.float32), np.asarray(end, dtype=np.float32)
     length = max(float(np.linalg.norm(b - a)), 1e-6)
     axis = (b - a) / length
     cap = np.radians([88, 60, 30])
     reach = np.concatenate(
-        [-radii[0] * np.sin(cap), length * np.linspace(0, 1, 5), length + radii[1] * np.sin(cap[::-1])]
+        [
+            -radii[0] * np.sin(cap),
+            length * np.linspace(0, 1, 5),
+            length + radii[1] * np.sin(cap[::-1]),
+        ]
     )
     t = np.linspace(0, 1, 5)
     middle = radii[0] + (radii[1] - radii[0]) * t + 0.12 * radii[0] * np.sin(np.pi * t**0.8)
@@ -169,7 +195,9 @@ def capsule(start: ArrayLike, end: ArrayLike, radii: tuple[float, float], side: 
 
 
 def ellipsoid(centre: ArrayLike, radii: tuple[float, float, float], texture: int) -> Mesh:
-    """An ellipsoid with its axes along x, y, z; u = 0.5 faces +x, v runs from the top down. radii: m."""
+    """An ellipsoid with its axes along x, y, z; u = 0.5 faces +x, v runs from the top down. radii:
+    m.
+    """
     polar = np.radians([2, 25, 50, 70, 90, 110, 130, 155, 178])
     centres = np.zeros((len(polar), 3), dtype=np.float32)
     centres[:, 2] = radii[2] * np.cos(polar)

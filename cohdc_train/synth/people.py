@@ -1,6 +1,7 @@
 """Articulated people: a body drawn once, a pose per frame, and the triangles of the two together.
 
-A person's own frame: x forward, y to the left, z up, the origin on the floor below the hips; m and rad.
+A person's own frame: x forward, y to the left, z up, the origin on the floor below the hips; m and
+rad.
 """
 
 from dataclasses import dataclass
@@ -23,8 +24,8 @@ class Person:
     """A body and what it wears.
 
     height: m; girth: 1 = slim adult; bare_arms, legwear (`trousers | shorts | skirt`), hairstyle
-    (`short | long | none`), coat: length the shirt hangs below the waist, as part of the height; textures: six, in the
-    order SHIRT TROUSERS SKIN FACE HAIR SHOES.
+    (`short | long | none`), coat: length the shirt hangs below the waist, as part of the height;
+    textures: six, in the order SHIRT TROUSERS SKIN FACE HAIR SHOES.
     """
 
     height: float
@@ -93,7 +94,9 @@ def walking(phase: float, vigour: float = 1.0) -> Pose:
 
 
 def sitting(fidget: float, gesture: float) -> Pose:
-    """Seated, a hand on each thigh; fidget -1..1 sways trunk and head a little, gesture 0..1 lifts the right hand."""
+    """Seated, a hand on each thigh; fidget -1..1 sways trunk and head a little, gesture 0..1 lifts
+    the right hand.
+    """
     return Pose(
         hips=(1.45, 1.5),
         knees=(1.5, 1.45),
@@ -107,14 +110,19 @@ def sitting(fidget: float, gesture: float) -> Pose:
 
 def seat_height(person: Person, pose: Pose) -> float:
     """Height above the floor of what a seated person's thighs rest on, m."""
-    soles = [_leg(person, side, hip, knee)[1] for side, hip, knee in zip((1, -1), pose.hips, pose.knees, strict=True)]
+    soles = [
+        _leg(person, side, hip, knee)[1]
+        for side, hip, knee in zip((1, -1), pose.hips, pose.knees, strict=True)
+    ]
     return -min(soles) - 0.05 * person.height * person.girth
 
 
 def draw_pose(rng: np.random.Generator) -> Pose:
     """A random moment: half of them walking, the others standing, gesturing or reaching."""
     kind = rng.random()
-    pose = walking(float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.5, 1.2)) if kind < 0.55 else 0.1)
+    pose = walking(
+        float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.5, 1.2)) if kind < 0.55 else 0.1
+    )
     if kind < 0.4:
         return pose
     left, right = (float(v) for v in rng.uniform(-0.3, 1.9, 2))
@@ -123,17 +131,27 @@ def draw_pose(rng: np.random.Generator) -> Pose:
         left, bends = pose.shoulders[0], (pose.elbows[0], bends[1])
     spread = (float(rng.uniform(0.05, 0.9)), float(rng.uniform(0.05, 0.9)))
     return Pose(
-        pose.hips, pose.knees, (left, right), bends, spread, float(rng.uniform(-0.05, 0.35)), float(rng.normal(0, 0.2))
+        pose.hips,
+        pose.knees,
+        (left, right),
+        bends,
+        spread,
+        float(rng.uniform(-0.05, 0.35)),
+        float(rng.normal(0, 0.2)),
     )
 
 
 def _direction(swing: float, spread: float) -> NDArray[np.float32]:
     """[3] where a limb points: `swing` forward of straight down, `spread` (signed) towards y."""
-    return np.array([np.sin(swing) * np.cos(spread), np.sin(spread), -np.cos(swing) * np.cos(spread)], dtype=np.float32)
+    return np.array(
+        [np.sin(swing) * np.cos(spread), np.sin(spread), -np.cos(swing) * np.cos(spread)],
+        dtype=np.float32,
+    )
 
 
 def person_mesh(person: Person, pose: Pose, position: tuple[float, float], heading: float) -> Mesh:
-    """The person standing on the floor at `position` (x, y) m, looking along `heading` rad, as instance 0.
+    """The person standing on the floor at `position` (x, y) m, looking along `heading` rad, as
+    instance 0.
 
     Texture numbers are 0..5 in the order of `Person.textures`.
     """
@@ -145,7 +163,9 @@ def person_mesh(person: Person, pose: Pose, position: tuple[float, float], headi
         lowest = min(lowest, sole)
     spine = np.array([np.sin(pose.lean), 0, np.cos(pose.lean)], dtype=np.float32)
     parts += _trunk(person, pose, spine) + _head(person, pose, spine)
-    for side, swing, bend, spread in zip((1, -1), pose.shoulders, pose.elbows, pose.spread, strict=True):
+    for side, swing, bend, spread in zip(
+        (1, -1), pose.shoulders, pose.elbows, pose.spread, strict=True
+    ):
         parts += _arm(person, spine, side, (swing, bend, spread))
     body = solids.join(parts)
     return body.moved(solids.yaw_rotation(heading), (position[0], position[1], -lowest))
@@ -166,7 +186,13 @@ def _leg(person: Person, side: int, hip: float, knee: float) -> tuple[list[Mesh]
     toe = heel + 0.105 * h * forward
     parts = [
         solids.capsule(top, middle, (0.052 * g, 0.034 * g * loose), LEFT, upper),
-        solids.capsule(middle, ankle, (0.033 * g * loose, 0.021 * g * loose**2), LEFT, TROUSERS if covered else SKIN),
+        solids.capsule(
+            middle,
+            ankle,
+            (0.033 * g * loose, 0.021 * g * loose**2),
+            LEFT,
+            TROUSERS if covered else SKIN,
+        ),
         solids.capsule(heel, toe, (0.024 * h, 0.02 * h), LEFT, SHOES),
     ]
     return parts, float(min(heel[2], toe[2]) - 0.024 * h)
@@ -179,15 +205,30 @@ def _trunk(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]
     belly = 1 + 1.2 * (person.girth - 1)
     level = np.array([-person.coat, 0.02, 0.08, 0.15, 0.22, 0.27, 0.295, 0.315], dtype=np.float32)
     wide = np.array([0.108, 0.104, 0.094, 0.1, 0.11, 0.108, 0.075, 0.03], dtype=np.float32)
-    deep = np.array([0.082, 0.076, 0.066 * belly, 0.068, 0.07, 0.062, 0.048, 0.03], dtype=np.float32)
-    chest = (np.where(level[:, None] > 0, level[:, None] * spine, level[:, None] * up) * h).astype(np.float32)
-    parts = [solids.tube(chest, (np.stack([wide, deep], 1) * g).astype(np.float32), LEFT, SHIRT, segments=16)]
+    deep = np.array(
+        [0.082, 0.076, 0.066 * belly, 0.068, 0.07, 0.062, 0.048, 0.03], dtype=np.float32
+    )
+    chest = (np.where(level[:, None] > 0, level[:, None] * spine, level[:, None] * up) * h).astype(
+        np.float32
+    )
+    parts = [
+        solids.tube(
+            chest, (np.stack([wide, deep], 1) * g).astype(np.float32), LEFT, SHIRT, segments=16
+        )
+    ]
     fall, width = np.array([0.04, 0.0, -0.06, -0.1]), np.array([0.09, 0.104, 0.1, 0.05])
     if person.legwear == "skirt":
         reach = max(abs(np.sin(a)) for a in pose.hips) * 0.2
-        fall, width = np.array([0.04, -0.02, -0.12, -0.22]), np.array([0.09, 0.108, 0.12 + reach / 2, 0.13 + reach])
+        fall, width = (
+            np.array([0.04, -0.02, -0.12, -0.22]),
+            np.array([0.09, 0.108, 0.12 + reach / 2, 0.13 + reach]),
+        )
     centres = (fall[:, None] * up * h).astype(np.float32)
-    parts.append(solids.tube(centres, np.stack([width, width * 0.78], 1).astype(np.float32) * g, LEFT, TROUSERS, 16))
+    parts.append(
+        solids.tube(
+            centres, np.stack([width, width * 0.78], 1).astype(np.float32) * g, LEFT, TROUSERS, 16
+        )
+    )
     return parts
 
 
@@ -195,7 +236,10 @@ def _head(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
     """Neck, head with its face forward, hair."""
     h = person.height
     neck = 0.305 * h * spine
-    tilt = np.array([np.sin(pose.lean * 0.3 + pose.nod), 0, np.cos(pose.lean * 0.3 + pose.nod)], dtype=np.float32)
+    tilt = np.array(
+        [np.sin(pose.lean * 0.3 + pose.nod), 0, np.cos(pose.lean * 0.3 + pose.nod)],
+        dtype=np.float32,
+    )
     centre = neck + 0.105 * h * tilt
     parts = [
         solids.capsule(neck - 0.02 * h * spine, centre, (0.032 * h, 0.03 * h), LEFT, SKIN),
@@ -210,7 +254,9 @@ def _head(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
     return parts
 
 
-def _arm(person: Person, spine: NDArray[np.float32], side: int, angles: tuple[float, float, float]) -> list[Mesh]:
+def _arm(
+    person: Person, spine: NDArray[np.float32], side: int, angles: tuple[float, float, float]
+) -> list[Mesh]:
     """Upper arm, forearm and hand; angles: (swing, bend, spread)."""
     h, g = person.height, person.height * person.girth
     swing, bend, spread = angles

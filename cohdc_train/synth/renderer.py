@@ -1,4 +1,6 @@
-"""Ray casting (Embree) of textured triangles: colour, exact depth and instance numbers of every pixel."""
+"""Ray casting (Embree) of textured triangles: colour, exact depth and instance numbers of every
+pixel.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +30,14 @@ class Camera:
     def freiburg3(cls, size: tuple[int, int]) -> "Camera":
         """TUM's freiburg3 camera (640 x 480) scaled to `size` (height, width)."""
         sy, sx = size[0] / 480, size[1] / 640
-        return cls(535.4 * sx, 539.2 * sy, (320.1 + 0.5) * sx - 0.5, (247.6 + 0.5) * sy - 0.5, size[1], size[0])
+        return cls(
+            535.4 * sx,
+            539.2 * sy,
+            (320.1 + 0.5) * sx - 0.5,
+            (247.6 + 0.5) * sy - 0.5,
+            size[1],
+            size[0],
+        )
 
     def resized(self, factor: float) -> "Camera":
         """The same view with `factor` times as many pixels a side."""
@@ -44,7 +53,8 @@ class Camera:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the N rays of a view meet. triangle: [N] int32, -1 = nothing; weights: [N, 2] barycentric; depth: [N] m;
+    """What the N rays of a view meet. triangle: [N] int32, -1 = nothing; weights: [N, 2]
+    barycentric; depth: [N] m;
     directions: [N, 3] world frame."""
 
     triangle: NDArray[np.int32]
@@ -57,7 +67,8 @@ class Hits:
 class View:
     """A rendered frame.
 
-    rgb: [H, W, 3] float32 >= 0, light before exposure; depth: [H, W] m along the optical axis, 0 = nothing;
+    rgb: [H, W, 3] float32 >= 0, light before exposure; depth: [H, W] m along the optical axis, 0 =
+    nothing;
     instance: [H, W] int32, 0 = room; facing: [H, W] cosine between the ray and the surface normal.
     """
 
@@ -84,7 +95,9 @@ class Atlas:
             places[k] = (x, y)
             x, shelf = x + width * 3 // 2, max(shelf, height)
         self.image: Texture = np.zeros((y + shelf, self._WIDTH, 3), dtype=np.uint8)
-        self.levels = np.array([int(np.log2(min(t.shape[:2]))) - 1 for t in textures], dtype=np.int32)
+        self.levels = np.array(
+            [int(np.log2(min(t.shape[:2]))) - 1 for t in textures], dtype=np.int32
+        )
         self.size = np.array([[t.shape[1], t.shape[0]] for t in textures], dtype=np.float32)
         # per texture and level: left, top, width - 1, height - 1 of the copy, px of the atlas
         self.copies = np.zeros((len(textures), int(self.levels.max()), 4), dtype=np.float32)
@@ -98,10 +111,16 @@ class Atlas:
             self.image[y : y + height, x : x + width] = image
             self.copies[k, level] = (x, y, width - 1, height - 1)
             x, y = (left + width, top) if level == 0 else (x, y + height)
-            image = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.uint8)
+            image = cv2.resize(
+                image, (width // 2, height // 2), interpolation=cv2.INTER_AREA
+            ).astype(np.uint8)
 
-    def sample(self, texture: NDArray[np.int32], uv: Floats, footprint: Floats, columns: int) -> Floats:
-        """[N, 3] float32 0..1 colours. uv: [N, 2]; footprint: [N] texels of the full texture a pixel covers."""
+    def sample(
+        self, texture: NDArray[np.int32], uv: Floats, footprint: Floats, columns: int
+    ) -> Floats:
+        """[N, 3] float32 0..1 colours. uv: [N, 2]; footprint: [N] texels of the full texture a
+        pixel covers.
+        """
         level = np.rint(np.log2(np.maximum(footprint, 1))).astype(np.int32)
         level = np.minimum(level, self.levels[texture] - 1)
         copy = np.take(self.copies.reshape(-1, 4), texture * self.copies.shape[1] + level, axis=0)
@@ -113,7 +132,9 @@ class Atlas:
 
 @lru_cache(maxsize=4)
 def rays(camera: Camera) -> Floats:
-    """[H * W, 3] directions in the camera frame with z = 1, so that a ray's length parameter is the depth."""
+    """[H * W, 3] directions in the camera frame with z = 1, so that a ray's length parameter is the
+    depth.
+    """
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
@@ -133,7 +154,9 @@ def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
     return Hits(found["primID"], weights, found["tfar"], directions)
 
 
-def render(mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: NDArray[np.float64]) -> View:
+def render(
+    mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: NDArray[np.float64]
+) -> View:
     """Colour, depth and instances of `mesh` seen by `camera` at `T_wc` [4, 4] (camera to world, m)."""
     hits = cast(mesh, camera, T_wc)
     triangle = np.maximum(hits.triangle, 0)
@@ -151,11 +174,15 @@ def render(mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: N
     rgb = albedo * _light(position, normal, lighting) * met[:, None]
     shape = (camera.height, camera.width)
     instance = np.where(met, mesh.instance[triangle], 0).astype(np.int32)
-    return View(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape), facing.reshape(shape))
+    return View(
+        rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape), facing.reshape(shape)
+    )
 
 
 def _interpolated(corners: Floats, triangle: NDArray[np.int32], weights: Floats) -> Floats:
-    """[N, C] a value given at the corners [T, 3, C], at barycentric weights of the second and third corner."""
+    """[N, C] a value given at the corners [T, 3, C], at barycentric weights of the second and third
+    corner.
+    """
     first = corners[:, 0]
     second, third = corners[:, 1] - first, corners[:, 2] - first
     value: Floats = np.take(first, triangle, axis=0)
@@ -175,7 +202,9 @@ def _density(mesh: Mesh, atlas: Atlas) -> Floats:
 
 
 def _light(position: Floats, normal: Floats, lighting: Lighting) -> Floats:
-    """[N, 3] light that falls on every point: ambient, stronger from above, and lamps with a falloff."""
+    """[N, 3] light that falls on every point: ambient, stronger from above, and lamps with a
+    falloff.
+    """
     lamps = lighting.lamps.T
     cosine = np.maximum(normal @ lamps - _dot(normal, position)[:, None], 0)
     square = _dot(position, position)[:, None] - 2 * (position @ lamps) + (lamps * lamps).sum(0)

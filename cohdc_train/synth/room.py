@@ -45,7 +45,9 @@ class Room:
 class _Builder:
     """Collects solids, textures and footprints of one room."""
 
-    def __init__(self, rng: np.random.Generator, size: tuple[float, float, float], detail: int) -> None:
+    def __init__(
+        self, rng: np.random.Generator, size: tuple[float, float, float], detail: int
+    ) -> None:
         self.rng, self.size, self.detail = rng, size, detail
         self.parts: list[Mesh] = []
         self.textures: list[Texture] = []
@@ -62,7 +64,8 @@ class _Builder:
         return self.add_texture(maker(self.rng, self.detail // 4, self.detail // 4))
 
     def shell(self, plain: bool = False) -> None:
-        """Floor, ceiling and four walls, each with a texture of its own, darker towards the corners.
+        """Floor, ceiling and four walls, each with a texture of its own, darker towards the
+        corners.
 
         plain: walls of even paint, without a mark.
         """
@@ -97,13 +100,19 @@ class _Builder:
                 look = self.add_texture(textures.poster(self.rng, side, side))
                 left = x - wide / 2 + self.rng.uniform(-0.15, 0.15)
                 if wall == 0:
-                    part = solids.quad((left - w / 2, length - 0.02, z), (wide, 0, 0), (0, 0, -tall), look)
+                    part = solids.quad(
+                        (left - w / 2, length - 0.02, z), (wide, 0, 0), (0, 0, -tall), look
+                    )
                 elif wall == 1:
                     part = solids.quad((0.02 - w / 2, left, z), (0, wide, 0), (0, 0, -tall), look)
                 elif wall == 2:
-                    part = solids.quad((w / 2 - 0.02, left + wide, z), (0, -wide, 0), (0, 0, -tall), look)
+                    part = solids.quad(
+                        (w / 2 - 0.02, left + wide, z), (0, -wide, 0), (0, 0, -tall), look
+                    )
                 else:
-                    part = solids.quad((left + wide - w / 2, 0.02, z), (-wide, 0, 0), (0, 0, -tall), look)
+                    part = solids.quad(
+                        (left + wide - w / 2, 0.02, z), (-wide, 0, 0), (0, 0, -tall), look
+                    )
                 self.parts.append(part)
 
     def shelf(self, x: float, y: float, yaw: float) -> None:
@@ -127,7 +136,11 @@ class _Builder:
         monitor = self.add_texture(textures.screen(rng, self.detail // 4, self.detail // 4))
         parts.append(
             solids.box(
-                (rng.uniform(-0.3, 0.3), 0.12, size[2] + 0.24), (0.52, 0.05, 0.34), rng.normal(0, 0.2), monitor, look
+                (rng.uniform(-0.3, 0.3), 0.12, size[2] + 0.24),
+                (0.52, 0.05, 0.34),
+                rng.normal(0, 0.2),
+                monitor,
+                look,
             )
         )
         for _ in range(int(rng.integers(3, 7))):
@@ -155,7 +168,9 @@ class _Builder:
         rings = np.zeros((4, 3), dtype=np.float32)
         rings[:, 2] = z
         turn: tuple[float, float, float] = (0.0, 1.0, 0.0)
-        return solids.tube(rings + np.array(centre, dtype=np.float32), np.stack([r, r], 1), turn, self.face(), 20)
+        return solids.tube(
+            rings + np.array(centre, dtype=np.float32), np.stack([r, r], 1), turn, self.face(), 20
+        )
 
     def carton(self, x: float, y: float, yaw: float) -> None:
         """A crate, cupboard or barrel on the floor."""
@@ -180,7 +195,9 @@ class _Builder:
         tint = 1 + self.rng.normal(0, 0.05, (count, 3))
         power = tint * self.rng.uniform(0.5, 1.1, (count, 1))
         ambient = self.rng.uniform(0.4, 0.7) * (1 + self.rng.normal(0, 0.03, 3))
-        return Lighting(lamps.astype(np.float32), power.astype(np.float32), ambient.astype(np.float32))
+        return Lighting(
+            lamps.astype(np.float32), power.astype(np.float32), ambient.astype(np.float32)
+        )
 
     def line_sides(self, first: float) -> None:
         """Furniture along both side walls from y = `first` m on."""
@@ -194,7 +211,9 @@ class _Builder:
         """What has been built, with shadows under it and lamps above."""
         footprints = np.array(self.footprints, dtype=np.float32).reshape(-1, 4)
         _shade_floor(self.textures[self.floor], footprints, self.size)
-        return Room(self.size, solids.join(self.parts), tuple(self.textures), self.lighting(), footprints)
+        return Room(
+            self.size, solids.join(self.parts), tuple(self.textures), self.lighting(), footprints
+        )
 
 
 def _cornered(image: Texture) -> Texture:
@@ -214,13 +233,17 @@ def texture_detail(size: tuple[int, int]) -> int:
 
 
 def furnished_room(
-    rng: np.random.Generator, size: tuple[float, float, float], walk_depth: float, detail: int = 1024
+    rng: np.random.Generator,
+    size: tuple[float, float, float],
+    walk_depth: float,
+    detail: int = 1024,
 ) -> Room:
     """Draw a room with furniture along the far wall and both sides.
 
-    size: (width, length, height) m; walk_depth: y up to which the floor stays free between the sides, m;
-    detail: side of the largest texture, px, a power of two of at least 128. Tables that would stand in 0..walk_depth
-    are moved behind it.
+    size: (width, length, height) m; walk_depth: y up to which the floor stays free between the
+    sides, m;
+    detail: side of the largest texture, px, a power of two of at least 128. Tables that would stand
+    in 0..walk_depth are moved behind it.
     """
     build = _Builder(rng, size, detail)
     build.shell()
@@ -228,7 +251,9 @@ def furnished_room(
     w, length, _ = size
     for x in np.arange(-w / 2 + 0.6, w / 2 - 0.5, 1.25):
         kind = (build.shelf, build.table, build.carton, build.table)[int(rng.integers(4))]
-        kind(float(x + rng.uniform(-0.1, 0.1)), length - rng.uniform(0.35, 0.5), rng.normal(0, 0.04))
+        kind(
+            float(x + rng.uniform(-0.1, 0.1)), length - rng.uniform(0.35, 0.5), rng.normal(0, 0.04)
+        )
     for x in np.arange(-w / 2 + 1.2, w / 2 - 1.0, 1.9):
         y = length - rng.uniform(1.4, 1.9)
         if y > walk_depth + 0.5 and rng.random() < 0.7:
@@ -237,8 +262,12 @@ def furnished_room(
     return build.room()
 
 
-def round_room(rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024) -> Room:
-    """Draw a room with furniture and pictures along all four walls and a free middle; arguments as `furnished_room`."""
+def round_room(
+    rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024
+) -> Room:
+    """Draw a room with furniture and pictures along all four walls and a free middle; arguments as
+    `furnished_room`.
+    """
     build = _Builder(rng, size, detail)
     build.shell()
     build.pictures(walls=4)
@@ -251,7 +280,9 @@ def round_room(rng: np.random.Generator, size: tuple[float, float, float], detai
     return build.room()
 
 
-def plain_room(rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024) -> Room:
+def plain_room(
+    rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024
+) -> Room:
     """Draw a room of plain walls with little before them; arguments as `furnished_room`."""
     build = _Builder(rng, size, detail)
     build.shell(plain=True)
@@ -262,7 +293,9 @@ def plain_room(rng: np.random.Generator, size: tuple[float, float, float], detai
     return build.room()
 
 
-def _shade_floor(floor: Texture, footprints: NDArray[np.float32], size: tuple[float, float, float]) -> None:
+def _shade_floor(
+    floor: Texture, footprints: NDArray[np.float32], size: tuple[float, float, float]
+) -> None:
     """Soft shadows of the furniture, laid over the floor's texture in place."""
     height, width = floor.shape[:2]
     shadow = np.ones((height, width), dtype=np.float32)

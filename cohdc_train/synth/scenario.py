@@ -38,10 +38,11 @@ class Setting:
     """What happens in the room.
 
     Args:
-        action: of the people. walk: they cross the view again and again; stop_and_go: they stand still for seconds,
-            then walk on; fill_view: one comes up to the camera and fills its view for a while, the others walk; sit:
-            they sit and fidget a little.
-        cart: a loaded cart that rolls to and fro across the view, by itself or pushed by the first of the people.
+        action: of the people. walk: they cross the view again and again; stop_and_go: they stand
+            still for seconds, then walk on; fill_view: one comes up to the camera and fills its
+            view for a while, the others walk; sit: they sit and fidget a little.
+        cart: a loaded cart that rolls to and fro across the view, by itself or pushed by the first
+            of the people.
         walls: textured and hung with pictures, or plain.
     """
 
@@ -54,19 +55,23 @@ class Setting:
         known = {name: get_args(kind.type) for name, kind in self.__dataclass_fields__.items()}
         for name, values in known.items():
             if getattr(self, name) not in values:
-                raise DataError(f"scene.{name}: {getattr(self, name)!r} is none of {', '.join(values)}")
+                raise DataError(
+                    f"scene.{name}: {getattr(self, name)!r} is none of {', '.join(values)}"
+                )
         if self.cart == "pushed" and people < 1:
             raise DataError("scene.cart: pushed, but there are 0 people to push it")
         if motion == "loop" and self != Setting():
-            raise DataError("motion: a loop goes with people who walk in a textured room, without a cart")
+            raise DataError(
+                "motion: a loop goes with people who walk in a textured room, without a cart"
+            )
 
 
 @dataclass(frozen=True)
 class Scene:
     """Everything a sequence shows, as functions of the frame number.
 
-    truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own; metered: frames whose brightness
-    sets the exposure of all.
+    truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own; metered:
+    frames whose brightness sets the exposure of all.
     """
 
     room: Room
@@ -82,7 +87,9 @@ class Scene:
 
     def atlas(self) -> Atlas:
         """The textures of room and actors."""
-        return Atlas([*self.room.textures, *(look for actor in self.actors for look in actor.textures)])
+        return Atlas(
+            [*self.room.textures, *(look for actor in self.actors for look in actor.textures)]
+        )
 
     def view(self, frame: int, atlas: Atlas) -> View:
         """The frame as a perfect camera sees it, the actors as instances 1.. in their order."""
@@ -116,7 +123,9 @@ class _Stage:
     def stopping(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
         """People who stop and go."""
         ways = walks.stop_and_go(self.rng, self.times, distances)
-        return [Walker(person, way.moved(0.0, _EYE_Y)) for person, way in zip(people, ways, strict=True)]
+        return [
+            Walker(person, way.moved(0.0, _EYE_Y)) for person, way in zip(people, ways, strict=True)
+        ]
 
     def filling(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
         """One before the camera, the others cross behind."""
@@ -129,7 +138,9 @@ class _Stage:
         chairs: list[Actor] = []
         still = np.zeros(len(self.times))
         sides = np.linspace(-0.38, 0.38, len(people)) if len(people) > 1 else np.zeros(1)
-        for person, side, distance in zip(people, self.rng.permutation(sides), distances, strict=True):
+        for person, side, distance in zip(
+            people, self.rng.permutation(sides), distances, strict=True
+        ):
             place = (float(side * distance), float(distance + _EYE_Y))
             heading = float(np.arctan2(-1.0, -side) + self.rng.uniform(-0.7, 0.7))
             fidget = sway(self.rng, self.times, 1.0, 3.0)
@@ -146,21 +157,40 @@ class _Stage:
         line = walks.errands(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
         way, behind = walks.rolled(self.rng, self.times, line, furniture.HANDLE - 0.5)
         ways = [walk.moved(0.0, distance + _EYE_Y) for walk in (way, behind)]
-        return [*(Walker(person, ways[1], pushes=True) for person in pusher), Thing(body, looks, ways[0])]
+        return [
+            *(Walker(person, ways[1], pushes=True) for person in pusher),
+            Thing(body, looks, ways[0]),
+        ]
 
 
 def draw_scene(
-    seed: int, frames: int, size: tuple[int, int], motion: CameraMotion, people: int, setting: Setting | None = None
+    seed: int,
+    frames: int,
+    size: tuple[int, int],
+    motion: CameraMotion,
+    people: int,
+    setting: Setting | None = None,
 ) -> Scene:
-    """Draw the room, the camera's path and the ways, so that what moves covers 20-40 % of the pixels on average.
+    """Draw the room, the camera's path and the ways, so that what moves covers 20-40 % of the
+    pixels on average.
 
-    size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of them fits SHARE (a
-    crowd: CROWD_SHARE), PEAK and EMPTY; the best is taken. Whoever fills the view is left out of that.
+    size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of
+    them fits SHARE (a
+    crowd: CROWD_SHARE), PEAK and EMPTY; the best is taken. Whoever fills the view is left out of
+    that.
     """
     setting = setting or Setting()
-    rng = stream(seed, "sequence", 1)  # apart from the room's, whose draws depend on the size of its textures
+    rng = stream(
+        seed, "sequence", 1
+    )  # apart from the room's, whose draws depend on the size of its textures
     length, height = float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8))
-    room = _room(seed, (7.5, length + 2.0 * (motion == "loop"), height), texture_detail(size), motion, setting)
+    room = _room(
+        seed,
+        (7.5, length + 2.0 * (motion == "loop"), height),
+        texture_detail(size),
+        motion,
+        setting,
+    )
     fine = np.arange(TRUTH_PER_FRAME * (frames - 1) + 1) / (RATE * TRUTH_PER_FRAME)
     middle = room.size[1] / 2 if motion == "loop" else _EYE_Y
     truth = camera_path(rng, fine, motion, np.array([0.0, middle, rng.uniform(1.25, 1.5)]))
@@ -171,25 +201,42 @@ def draw_scene(
     fitted = not nobody and setting.action != "fill_view"
 
     def draw(nearest: float) -> Scene:
-        return Scene(room, _actors(stage, setting, cast, nearest), Camera.freiburg3(size), truth, metered)
+        return Scene(
+            room, _actors(stage, setting, cast, nearest), Camera.freiburg3(size), truth, metered
+        )
 
     return _fitted(draw, people) if fitted else draw(1.3)
 
 
-def _room(seed: int, size: tuple[float, float, float], detail: int, motion: CameraMotion, setting: Setting) -> Room:
+def _room(
+    seed: int, size: tuple[float, float, float], detail: int, motion: CameraMotion, setting: Setting
+) -> Room:
     rng = stream(seed, "sequence")
     if motion == "loop":
         return round_room(rng, size, detail)
-    return plain_room(rng, size, detail) if setting.walls == "plain" else furnished_room(rng, size, 3.4, detail)
+    return (
+        plain_room(rng, size, detail)
+        if setting.walls == "plain"
+        else furnished_room(rng, size, 3.4, detail)
+    )
 
 
-def _actors(stage: _Stage, setting: Setting, cast: list[bodies.Person], nearest: float) -> tuple[Actor, ...]:
+def _actors(
+    stage: _Stage, setting: Setting, cast: list[bodies.Person], nearest: float
+) -> tuple[Actor, ...]:
     """Everybody, the nearest `nearest` m from the eye: people first, things last."""
     pushers = 1 if setting.cart == "pushed" else 0
     others = cast[pushers:]
-    distances = nearest + min(0.35, 2.0 / max(len(others) - 1, 1)) * np.arange(len(others), dtype=np.float64)
+    distances = nearest + min(0.35, 2.0 / max(len(others) - 1, 1)) * np.arange(
+        len(others), dtype=np.float64
+    )
     distances += 0.0 if setting.cart == "none" else 0.9
-    act = {"walk": stage.crowd, "stop_and_go": stage.stopping, "fill_view": stage.filling, "sit": stage.seated}
+    act = {
+        "walk": stage.crowd,
+        "stop_and_go": stage.stopping,
+        "fill_view": stage.filling,
+        "sit": stage.seated,
+    }
     actors = act[setting.action](others, distances)
     if setting.cart != "none":
         actors += stage.rolling(cast[:pushers], nearest)

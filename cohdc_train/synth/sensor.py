@@ -1,4 +1,6 @@
-"""What an RGB-D camera of Kinect's kind makes of a rendered view: noise, blur, quantised depth with holes."""
+"""What an RGB-D camera of Kinect's kind makes of a rendered view: noise, blur, quantised depth with
+holes.
+"""
 
 import cv2
 import numpy as np
@@ -14,12 +16,18 @@ EDGE_DROPOUT = 0.6
 
 
 def exposure(rgb: Floats, brightness: float = 0.37) -> float:
-    """The factor that brings a rendered image to the mean `brightness` (1 = white), as a camera's automatic would."""
+    """The factor that brings a rendered image to the mean `brightness` (1 = white), as a camera's
+    automatic would.
+    """
     return brightness / max(float(np.minimum(rgb, 1.5 * rgb.mean()).mean()), 1e-3)
 
 
-def photograph(rgb: Floats, rng: np.random.Generator, sigma: float = RGB_SIGMA, blur: float = 0.6) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8 of an exposed float image (1 = white): the optics' blur (sigma px), noise (sigma grey levels)."""
+def photograph(
+    rgb: Floats, rng: np.random.Generator, sigma: float = RGB_SIGMA, blur: float = 0.6
+) -> NDArray[np.uint8]:
+    """[H, W, 3] uint8 of an exposed float image (1 = white): the optics' blur (sigma px), noise
+    (sigma grey levels).
+    """
     bounded = np.minimum(rgb, 1)
     soft = cv2.GaussianBlur(bounded, (0, 0), blur) if blur > 0.2 else bounded
     noisy = soft * 255 + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(sigma)
@@ -36,11 +44,15 @@ def smear(rgb: Floats, length: float, angle: float) -> Floats:
     dx, dy = half * np.cos(angle), half * np.sin(angle)
     ends = ((round(half - dx), round(half - dy)), (round(half + dx), round(half + dy)))
     cv2.line(kernel, ends[0], ends[1], (1.0,), 1, cv2.LINE_8)
-    return cv2.filter2D(rgb, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE).astype(np.float32)
+    return cv2.filter2D(rgb, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE).astype(
+        np.float32
+    )
 
 
 def depth_edges(depth: Floats) -> NDArray[np.bool_]:
-    """[H, W] pixels whose 3 x 3 neighbourhood spans more than 4 % of its depth: both sides of every outline."""
+    """[H, W] pixels whose 3 x 3 neighbourhood spans more than 4 % of its depth: both sides of every
+    outline.
+    """
     kernel = np.ones((3, 3), dtype=np.uint8)
     span = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
     edges: NDArray[np.bool_] = span > 0.04 * depth
@@ -50,8 +62,8 @@ def depth_edges(depth: Floats) -> NDArray[np.bool_]:
 def measure_depth(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:
     """[H, W] uint16 depth image, 5000 per metre, 0 = no reading.
 
-    Sigma .0012 + .0019 (z - .4)^2 m; 60 % of the readings on depth edges are lost, those of dark and of grazing
-    surfaces in part, some in blobs, and all outside .4-5 m.
+    Sigma .0012 + .0019 (z - .4)^2 m; 60 % of the readings on depth edges are lost, those of dark
+    and of grazing surfaces in part, some in blobs, and all outside .4-5 m.
     """
     z = view.depth
     sigma = 0.0012 + 0.0019 * np.square(z - 0.4)

@@ -32,17 +32,20 @@ def sequence(
     people: int = 3,
     scene: Setting = Setting(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
 ) -> None:
-    """Render an RGB-D sequence with people in TUM's layout (rgb/, depth/, rgb.txt, depth.txt, groundtruth.txt).
+    """Render an RGB-D sequence with people in TUM's layout (rgb/, depth/, rgb.txt, depth.txt,
+    groundtruth.txt).
 
-    Beside TUM's files: masks/ (255 = person), movers/ (255 = whoever and whatever moves in this frame: not a person who
-    stands or sits still, but a cart that rolls), camera.yaml, info.json (share of person pixels per frame).
+    Beside TUM's files: masks/ (255 = person), movers/ (255 = whoever and whatever moves in this
+    frame: not a person who stands or sits still, but a cart that rolls), camera.yaml, info.json
+    (share of person pixels per frame).
 
     Args:
         out: new or empty folder.
         frames: number of frames, at 30 per second; at least 2.
         size: height and width of the images, px; at least 48 each.
         seed: same seed, same bytes.
-        motion: camera motion as in TUM's walking sequences; loop: once round the room (give it 300 frames and more).
+        motion: camera motion as in TUM's walking sequences; loop: once round the room (give it 300
+            frames and more).
         people: how many there are, 0 to 12; more than 6 are a crowd.
         scene: what happens in the room.
     """
@@ -79,7 +82,9 @@ def _check(frames: int, size: tuple[int, int], seed: int, motion: str, people: i
     if frames < 2:
         raise DataError(f"frames: {frames} is too few; a sequence has at least 2")
     if min(size) < 48:
-        raise DataError(f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48")
+        raise DataError(
+            f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48"
+        )
     if seed < 0:
         raise DataError(f"seed: {seed} is negative")
     if motion not in MOTIONS:
@@ -94,7 +99,9 @@ def stamps(frames: int) -> list[str]:
 
 
 def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[Doubles, Doubles]:
-    """Write rgb/, depth/, masks/ and movers/; returns the shares of person pixels and of moving ones per frame."""
+    """Write rgb/, depth/, masks/ and movers/; returns the shares of person pixels and of moving
+    ones per frame.
+    """
     for name in ("rgb", "depth", "masks", "movers"):
         (folder / name).mkdir()
     rng = stream(seed, "sequence", 2)
@@ -105,7 +112,9 @@ def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[Doubles, Doubl
         view = scene.view(k, atlas)
         rgb = photograph(view.rgb * gain, rng, blur=0.6 * scene.camera.width / 640)
         person = np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance]
-        moves = np.array([False, *(fastest(actor, k, frames, RATE) > MOVES for actor in scene.actors)])[view.instance]
+        moves = np.array(
+            [False, *(fastest(actor, k, frames, RATE) > MOVES for actor in scene.actors)]
+        )[view.instance]
         _write_png(folder / "rgb" / f"{stamp}.png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
         _write_png(folder / "depth" / f"{stamp}.png", measure_depth(view, rng))
         _write_png(folder / "masks" / f"{stamp}.png", person.astype(np.uint8) * 255)
@@ -116,7 +125,9 @@ def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[Doubles, Doubl
 
 
 def _write_png(path: Path, image: NDArray[Any]) -> None:
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, 2]):
+    if not cv2.imwrite(
+        str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, 2]
+    ):
         raise DataError(f"{path}: cannot be written")
 
 
@@ -142,5 +153,9 @@ def _write_truth(path: Path, truth: Doubles, title: str) -> None:
 def _write_camera(path: Path, camera: Camera) -> None:
     values = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     lines = [f"{name}: {value:.6f}" for name, value in values.items()]
-    lines += [f"width: {camera.width}", f"height: {camera.height}", f"depth_scale: {DEPTH_SCALE:.1f}"]
+    lines += [
+        f"width: {camera.width}",
+        f"height: {camera.height}",
+        f"depth_scale: {DEPTH_SCALE:.1f}",
+    ]
     path.write_text("\n".join(lines) + "\n")

@@ -27,7 +27,9 @@ def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Floa
     return np.clip(mixed, low, high).astype(np.float32)
 
 
-def finish(image: Floats, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0) -> Texture:
+def finish(
+    image: Floats, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0
+) -> Texture:
     """Dirt and grain over a drawn surface in muted colours: float [h, w, 3] in 0..255 -> uint8."""
     height, width = image.shape[:2]
     grey = image.mean(axis=2, keepdims=True)
@@ -52,7 +54,9 @@ def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
             end = (x + int(rng.normal(0, width / 30)), y + int(rng.normal(0, height / 30)))
             cv2.line(image, (x, y), end, shade, int(rng.integers(1, 3)), cv2.LINE_AA)
         else:
-            cv2.circle(image, (x, y), int(rng.integers(1, max(width // 90, 3))), shade, -1, cv2.LINE_AA)
+            cv2.circle(
+                image, (x, y), int(rng.integers(1, max(width // 90, 3))), shade, -1, cv2.LINE_AA
+            )
     return finish(image, rng, 7, 12)
 
 
@@ -94,19 +98,28 @@ def tiles(rng: np.random.Generator, height: int, width: int) -> Texture:
 def wood(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Planks with grain along u, board ends and knots."""
     boards = int(rng.integers(3, 9))
-    base = np.array([rng.uniform(90, 190), rng.uniform(60, 140), rng.uniform(30, 95)], dtype=np.float32)
+    base = np.array(
+        [rng.uniform(90, 190), rng.uniform(60, 140), rng.uniform(30, 95)], dtype=np.float32
+    )
     image = np.zeros((height, width, 3), dtype=np.float32)
     for b in range(boards):
         top, bottom = b * height // boards, (b + 1) * height // boards
-        grain = cv2.resize(noise(rng, 64, 16, 8), (width, bottom - top), interpolation=cv2.INTER_CUBIC)
+        grain = cv2.resize(
+            noise(rng, 64, 16, 8), (width, bottom - top), interpolation=cv2.INTER_CUBIC
+        )
         image[top:bottom] = base + rng.normal(0, 14) + grain[..., None] * 12
         image[top : top + max(height // 200, 1)] *= 0.45
         end = int(rng.integers(width))
         image[top:bottom, end : end + max(width // 200, 1)] *= 0.45
         for _ in range(int(rng.integers(1, 5))):
             knot = (int(rng.integers(width)), int(rng.integers(top, bottom)))
-            axes = (int(rng.integers(2, max(width // 40, 3))), int(rng.integers(2, max(height // 80, 3))))
-            cv2.ellipse(image, knot, axes, 0, 0, 360, tuple(float(v) for v in base * 0.5), -1, cv2.LINE_AA)
+            axes = (
+                int(rng.integers(2, max(width // 40, 3))),
+                int(rng.integers(2, max(height // 80, 3))),
+            )
+            cv2.ellipse(
+                image, knot, axes, 0, 0, 360, tuple(float(v) for v in base * 0.5), -1, cv2.LINE_AA
+            )
     return finish(image, rng, 6, 6)
 
 
@@ -114,7 +127,9 @@ def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Stripes with a motif that changes its colour and size from place to place."""
     ground, stripe = colour(rng, 90, 225), colour(rng, 60, 225)
     period = int(rng.integers(width // 14, width // 6))
-    image = np.where(((np.arange(width) // max(period // 2, 1)) % 2 == 0)[None, :, None], ground, stripe)
+    image = np.where(
+        ((np.arange(width) // max(period // 2, 1)) % 2 == 0)[None, :, None], ground, stripe
+    )
     image = np.ascontiguousarray(np.broadcast_to(image, (height, width, 3))).astype(np.float32)
     step = max(int(period * rng.uniform(0.6, 1.2)), 6)
     for y in range(step // 2, height, step):
@@ -123,7 +138,9 @@ def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
             radius = int(rng.integers(max(step // 8, 2), max(step // 3, 4)))
             sides = int(rng.integers(3, 8))
             angle = np.linspace(0, 2 * np.pi, sides, endpoint=False) + rng.uniform(0, 6)
-            star = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], 1).astype(np.int32)
+            star = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], 1).astype(
+                np.int32
+            )
             cv2.fillPoly(image, [star], ink, cv2.LINE_AA)
     return finish(image, rng, 5, 8)
 
@@ -135,7 +152,11 @@ def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
         x, y = int(rng.integers(width)), int(rng.integers(height))
         w, h = int(rng.integers(4, max(width // 8, 6))), int(rng.integers(4, max(height // 8, 6)))
         cv2.rectangle(
-            image, (x, y), (x + w, y + h), tuple(float(v) for v in colour(rng, 40, 190)), int(rng.choice([-1, 2, 3]))
+            image,
+            (x, y),
+            (x + w, y + h),
+            tuple(float(v) for v in colour(rng, 40, 190)),
+            int(rng.choice([-1, 2, 3])),
         )
     return finish(image, rng, 18, 10)
 
@@ -145,15 +166,28 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Texture:
     image = flat(height, width, colour(rng, 30, 235))
     for _ in range(int(rng.integers(8, 22))):
         ink = tuple(float(v) for v in colour(rng, 10, 245))
-        corners = rng.uniform(0, 1, (int(rng.integers(3, 6)), 2)) * rng.uniform(0.2, 0.7) + rng.uniform(-0.1, 0.8, 2)
+        corners = rng.uniform(0, 1, (int(rng.integers(3, 6)), 2)) * rng.uniform(
+            0.2, 0.7
+        ) + rng.uniform(-0.1, 0.8, 2)
         cv2.fillPoly(image, [(corners * [width, height]).astype(np.int32)], ink, cv2.LINE_AA)
         centre = (int(rng.integers(width)), int(rng.integers(height)))
         cv2.circle(
-            image, centre, int(rng.integers(2, max(width // 7, 4))), ink[::-1], int(rng.choice([-1, 2])), cv2.LINE_AA
+            image,
+            centre,
+            int(rng.integers(2, max(width // 7, 4))),
+            ink[::-1],
+            int(rng.choice([-1, 2])),
+            cv2.LINE_AA,
         )
     letters(image, rng, int(rng.integers(1, 6)))
     edge = max(width // 32, 2)
-    cv2.rectangle(image, (0, 0), (width - 1, height - 1), tuple(float(v) for v in colour(rng, 10, 120)), 2 * edge)
+    cv2.rectangle(
+        image,
+        (0, 0),
+        (width - 1, height - 1),
+        tuple(float(v) for v in colour(rng, 10, 120)),
+        2 * edge,
+    )
     return finish(image, rng, 5, 4)
 
 
@@ -193,7 +227,10 @@ def carton(rng: np.random.Generator, height: int, width: int) -> Texture:
     image[:, width // 2 - width // 20 : width // 2 + width // 20] *= 0.8
     for _ in range(int(rng.integers(2, 6))):
         x, y = int(rng.integers(0, width * 3 // 4)), int(rng.integers(0, height * 3 // 4))
-        end = (x + int(rng.integers(width // 10, width // 3)), y + int(rng.integers(height // 10, height // 3)))
+        end = (
+            x + int(rng.integers(width // 10, width // 3)),
+            y + int(rng.integers(height // 10, height // 3)),
+        )
         cv2.rectangle(image, (x, y), end, tuple(float(v) for v in colour(rng, 20, 245)), -1)
     letters(image, rng, 4)
     return finish(image, rng, 7, 9)

@@ -1,4 +1,6 @@
-"""Where people walk and things roll in a sequence. World frame: z up, y away from the camera, m, s, rad."""
+"""Where people walk and things roll in a sequence. World frame: z up, y away from the camera, m, s,
+rad.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -30,15 +32,23 @@ class Walk:
         return replace(self, position=self.position + np.array([x, y]))
 
 
-def crowd(rng: np.random.Generator, times: Doubles, distances: Doubles, reach: float) -> tuple[Walk, ...]:
-    """People who cross the view side by side, again and again, slowly, mostly in one direction, stopping midway.
+def crowd(
+    rng: np.random.Generator, times: Doubles, distances: Doubles, reach: float
+) -> tuple[Walk, ...]:
+    """People who cross the view side by side, again and again, slowly, mostly in one direction,
+    stopping midway.
 
-    times: [n] s, even steps; distances: [p] m, how far in front of the eye each one walks; reach: how far beyond the
-    border of the view a crossing begins and ends, m. Between two crossings nobody is in sight. A group that moves as
-    one and covers half the view is what misleads a camera that trusts the majority. Positions are relative to the eye.
+    times: [n] s, even steps; distances: [p] m, how far in front of the eye each one walks; reach:
+    how far beyond the border of the view a crossing begins and ends, m. Between two crossings
+    nobody is in sight. A group that moves as one and covers half the view is what misleads a camera
+    that trusts the majority. Positions are relative to the eye.
     """
     step = float(times[1] - times[0])
-    sides = 0.3 * distances * rng.permutation(np.linspace(-1, 1, len(distances)) if len(distances) > 1 else np.zeros(1))
+    sides = (
+        0.3
+        * distances
+        * rng.permutation(np.linspace(-1, 1, len(distances)) if len(distances) > 1 else np.zeros(1))
+    )
     half = float(np.max(0.62 * distances + np.abs(sides))) + reach
     usual = float(rng.choice([-1.0, 1.0]))
     pieces: list[Doubles] = []
@@ -55,18 +65,27 @@ def crowd(rng: np.random.Generator, times: Doubles, distances: Doubles, reach: f
 
 
 def _walk_in_crowd(
-    rng: np.random.Generator, times: Doubles, line: Doubles, place: tuple[float, float], jumps: NDArray[np.int64]
+    rng: np.random.Generator,
+    times: Doubles,
+    line: Doubles,
+    place: tuple[float, float],
+    jumps: NDArray[np.int64],
 ) -> Walk:
-    """One of a crowd: `line` [n] m is the way of its middle, `place` (distance, side) m this person's place in it."""
+    """One of a crowd: `line` [n] m is the way of its middle, `place` (distance, side) m this
+    person's place in it.
+    """
     x = line + place[1] + sway(rng, times, 0.06, 4.0)
     y = place[0] + sway(rng, times, 0.08, 6.0)
     return walk_along(times, np.stack([x, y], 1), float(rng.uniform(0, 1.4)), jumps)
 
 
-def walk_along(times: Doubles, position: Doubles, start: float, jumps: NDArray[np.int64] | None = None) -> Walk:
+def walk_along(
+    times: Doubles, position: Doubles, start: float, jumps: NDArray[np.int64] | None = None
+) -> Walk:
     """A person who walks where `position` [n, 2] m leads, looking ahead.
 
-    start: m travelled before; jumps: frames at which the person is put elsewhere and goes on as before.
+    start: m travelled before; jumps: frames at which the person is put elsewhere and goes on as
+    before.
     """
     velocity = np.diff(position, axis=0, prepend=position[:1])
     if jumps is not None:
@@ -85,22 +104,30 @@ def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
     pause = rng.uniform(0.7, 1.5)
     first, last = (stop + half) / pace, (half - stop) / pace
     duration = first + pause + last
-    x = np.interp(np.arange(0, duration, step), [0, first, first + pause, duration], [-half, stop, stop, half])
+    x = np.interp(
+        np.arange(0, duration, step), [0, first, first + pause, duration], [-half, stop, stop, half]
+    )
     return _smooth(x, _SMOOTH / step)
 
 
 def _smooth(line: Doubles, frames: float) -> Doubles:
     """Moving mean of [n] over `frames`."""
     window = max(round(frames), 1) | 1
-    smooth: Doubles = np.convolve(np.pad(line, window // 2, mode="edge"), np.ones(window) / window, mode="valid")
+    smooth: Doubles = np.convolve(
+        np.pad(line, window // 2, mode="edge"), np.ones(window) / window, mode="valid"
+    )
     return smooth
 
 
-def led_round(walks: tuple[Walk, ...], times: Doubles, eyes: Doubles, headings: Doubles) -> tuple[Walk, ...]:
-    """The walks of a crowd bent into arcs about `eyes` [n, 2] m, and turned with a camera that looks along `headings`.
+def led_round(
+    walks: tuple[Walk, ...], times: Doubles, eyes: Doubles, headings: Doubles
+) -> tuple[Walk, ...]:
+    """The walks of a crowd bent into arcs about `eyes` [n, 2] m, and turned with a camera that
+    looks along `headings`.
 
-    headings: [n] rad to the right of +y. What was ahead and to the side of the eye becomes a distance and an angle, so
-    that people who walk round the room with the camera, crossing its view, never meet a wall.
+    headings: [n] rad to the right of +y. What was ahead and to the side of the eye becomes a
+    distance and an angle, so that people who walk round the room with the camera, crossing its
+    view, never meet a wall.
     """
     bent = []
     for walk in walks:
@@ -111,10 +138,14 @@ def led_round(walks: tuple[Walk, ...], times: Doubles, eyes: Doubles, headings: 
     return tuple(bent)
 
 
-def errands(rng: np.random.Generator, times: Doubles, reach: float, pause: tuple[float, float], pace: float) -> Doubles:
-    """[n] m: a thing that stands still, goes to another place within +-reach, stands again, and so on.
+def errands(
+    rng: np.random.Generator, times: Doubles, reach: float, pause: tuple[float, float], pace: float
+) -> Doubles:
+    """[n] m: a thing that stands still, goes to another place within +-reach, stands again, and so
+    on.
 
-    It begins at rest; pauses last `pause` (least, most) s; pace: m/s. Every way leads to the other side of 0.
+    It begins at rest; pauses last `pause` (least, most) s; pace: m/s. Every way leads to the other
+    side of 0.
     """
     knots = list(_stops(rng, float(times[-1]), reach, pause, pace))
     line = np.interp(times, [t for t, _ in knots], [x for _, x in knots])
@@ -135,36 +166,47 @@ def _stops(
     yield t, x
 
 
-def rolled(rng: np.random.Generator, times: Doubles, line: Doubles, behind: float) -> tuple[Walk, Walk]:
-    """The ways of a cart that goes forwards and backwards along `line` [n] m, aslant, and of who pushes it.
+def rolled(
+    rng: np.random.Generator, times: Doubles, line: Doubles, behind: float
+) -> tuple[Walk, Walk]:
+    """The ways of a cart that goes forwards and backwards along `line` [n] m, aslant, and of who
+    pushes it.
 
-    behind: where along the cart's x its pusher walks, m. Positions are relative to the middle of the line.
+    behind: where along the cart's x its pusher walks, m. Positions are relative to the middle of
+    the line.
     """
     slant = float(rng.uniform(-0.25, 0.25))
     heading = slant + np.pi * float(rng.integers(2))
     position = line[:, None] * np.array([np.cos(slant), np.sin(slant)])
     ahead = np.array([np.cos(heading), np.sin(heading)])
     gone = (position - position[0]) @ ahead
-    pace = np.clip(np.abs(np.diff(gone, prepend=gone[0])) / float(times[1] - times[0]) / 0.4, 0, 1.15)
+    pace = np.clip(
+        np.abs(np.diff(gone, prepend=gone[0])) / float(times[1] - times[0]) / 0.4, 0, 1.15
+    )
     cart = Walk(position, np.full(len(times), heading), gone, pace)
     return cart, replace(cart, position=position + behind * ahead)
 
 
 def stop_and_go(rng: np.random.Generator, times: Doubles, distances: Doubles) -> tuple[Walk, ...]:
-    """People who stand in the view for 1.5-2.5 s without a movement, walk on, stand again, each at a time of their own.
+    """People who stand in the view for 1.5-2.5 s without a movement, walk on, stand again, each at
+    a time of their own.
 
     Arguments and frame as in `crowd`.
     """
     walks = []
     for distance in distances:
         line = errands(rng, times, 0.42 * float(distance), (1.5, 2.5), float(rng.uniform(0.6, 0.8)))
-        walk = walk_along(times, np.stack([line, np.full_like(line, distance)], 1), float(rng.uniform(0, 1.4)))
+        walk = walk_along(
+            times, np.stack([line, np.full_like(line, distance)], 1), float(rng.uniform(0, 1.4))
+        )
         walks.append(replace(walk, heading=_turning(times, line)))
     return tuple(walks)
 
 
 def _turning(times: Doubles, line: Doubles) -> Doubles:
-    """[n] rad: 0 while `line` [n] m rises, pi while it falls; the turn between is over when the way begins."""
+    """[n] rad: 0 while `line` [n] m rises, pi while it falls; the turn between is over when the way
+    begins.
+    """
     lead = round(_TURN / 2 / float(times[1] - times[0]))
     ways = np.sign(np.diff(line, append=line[-1]))
     moving = np.flatnonzero(ways)
@@ -175,16 +217,24 @@ def _turning(times: Doubles, line: Doubles) -> Doubles:
 
 
 def approach(times: Doubles, poses: Doubles) -> Walk:
-    """A person who comes up to the camera, stands before it for 3 tenths of the time, wherever it moves, and goes.
+    """A person who comes up to the camera, stands before it for 3 tenths of the time, wherever it
+    moves, and goes.
 
     poses: [n, 4, 4] T_wc of the camera. World frame.
     """
     t = times / times[-1]
     step = float(times[1] - times[0])
-    away = _smooth(np.interp(t, [0, 0.15, 0.38, 0.68, 0.95, 1], [1.8, 1.8, _NEAR, _NEAR, 2.0, 2.0]), _SMOOTH / step)
-    aside = _smooth(np.interp(t, [0, 0.15, 0.38, 0.68, 0.95], [-0.5, -0.5, 0.0, 0.0, 0.7]), _SMOOTH / step)
+    away = _smooth(
+        np.interp(t, [0, 0.15, 0.38, 0.68, 0.95, 1], [1.8, 1.8, _NEAR, _NEAR, 2.0, 2.0]),
+        _SMOOTH / step,
+    )
+    aside = _smooth(
+        np.interp(t, [0, 0.15, 0.38, 0.68, 0.95], [-0.5, -0.5, 0.0, 0.0, 0.7]), _SMOOTH / step
+    )
     forward = poses[:, :2, 2] / np.linalg.norm(poses[:, :2, 2], axis=1, keepdims=True)
     right = np.stack([forward[:, 1], -forward[:, 0]], 1)
-    walk = walk_along(times, poses[:, :2, 3] + away[:, None] * forward + aside[:, None] * right, 0.0)
+    walk = walk_along(
+        times, poses[:, :2, 3] + away[:, None] * forward + aside[:, None] * right, 0.0
+    )
     azimuth = np.arctan2(forward[:, 1], forward[:, 0])
     return replace(walk, heading=azimuth + np.interp(t, [0.66, 0.76], [np.pi, 0.0]))

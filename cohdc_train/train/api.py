@@ -21,17 +21,20 @@ def fit(
     Args:
         data: COCO-format folder, or several; the first one is validated on.
         out: folder for checkpoints, logs and figures.
-        config: YAML files that add up, shipped ones such as "networks/hdc_net_s.yaml" too; HDC-Net n without one.
+        config: YAML files that add up, shipped ones such as "networks/hdc_net_s.yaml" too; HDC-Net
+            n without one.
         minutes: length of the training.
         epochs: length of the training; whichever comes first ends it.
-        overrides: options of `cohdc fit` by name, such as {"data.batch_size": 4, "pretrained": "imagenet"}.
+        overrides: options of `cohdc fit` by name, such as {"data.batch_size": 4, "pretrained":
+            "imagenet"}.
 
     Returns:
         The path of best.ckpt.
 
     Raises:
         CohdcError: in one line, for whatever the user can fix.
-        SystemExit: an override is no option of `cohdc fit`, or of another type; the message is on stderr.
+        SystemExit: an override is no option of `cohdc fit`, or of another type; the message is on
+            stderr.
     """
     roots = [data] if isinstance(data, Path | str) else list(data)
     configs = [config] if isinstance(config, Path | str) else list(config)

@@ -14,14 +14,17 @@ from cohdc_train.train.module import MaskRCNNModule
 
 LARGEST = 32  # more makes no step faster
 _SHARE = {"cuda": 0.85, "cpu": 0.5}  # of the memory that is free before the first step
-_STATUS, _MEMORY, _RESET = (Path("/proc") / p for p in ("self/status", "meminfo", "self/clear_refs"))
+_STATUS, _MEMORY, _RESET = (
+    Path("/proc") / p for p in ("self/status", "meminfo", "self/clear_refs")
+)
 
 
 def largest_batch(module: MaskRCNNModule, data: CocoDataModule, device: torch.device) -> int:
-    """A power of two, at most LARGEST, found by passes of a copy of the network over one and two worst images.
+    """A power of two, at most LARGEST, found by passes of a copy of the network over one and two
+    worst images.
 
-    The worst image fills the canvas and has as many objects as the fullest training image. The memory of larger batches
-    is extrapolated; activations grow in proportion.
+    The worst image fills the canvas and has as many objects as the fullest training image. The
+    memory of larger batches is extrapolated; activations grow in proportion.
     Raises CohdcError when not even one image fits, or the machine does not tell its memory.
     """
     free = _free(device)
@@ -32,7 +35,9 @@ def largest_batch(module: MaskRCNNModule, data: CocoDataModule, device: torch.de
     room = fitting(one, two, free * _SHARE[device.type])
     if room < 1:
         needed, there = one / 2**30, free / 2**30
-        raise CohdcError(f"batch_size auto: one image takes {needed:.1f} of {there:.1f} free GiB; lower the canvas")
+        raise CohdcError(
+            f"batch_size auto: one image takes {needed:.1f} of {there:.1f} free GiB; lower the canvas"
+        )
     return min(LARGEST, 1 << (room.bit_length() - 1))
 
 
@@ -42,7 +47,9 @@ def fitting(one: float, two: float, budget: float) -> int:
 
 
 def worst_batch(data: CocoDataModule, size: int) -> TrainBatch:
-    """`size` images of noise that fill the canvas, each with as many objects as the fullest training image."""
+    """`size` images of noise that fill the canvas, each with as many objects as the fullest
+    training image.
+    """
     height, width = data.canvas
     images = [image for split in data.folder.train for image in split.images]
     count = max(sum(not o.crowd for o in image.objects) for image in images)
@@ -60,9 +67,13 @@ def worst_batch(data: CocoDataModule, size: int) -> TrainBatch:
 
 
 def _peak(network: MaskRCNN, batch: TrainBatch, device: torch.device) -> int:
-    """Bytes that a forward and a backward pass take at most, the optimizer's two moments of each weight included."""
+    """Bytes that a forward and a backward pass take at most, the optimizer's two moments of each
+    weight included.
+    """
     images = batch.images.to(device)
-    targets = [{k: v.to(device) if torch.is_tensor(v) else v for k, v in t.items()} for t in batch.targets]
+    targets = [
+        {k: v.to(device) if torch.is_tensor(v) else v for k, v in t.items()} for t in batch.targets
+    ]
     gc.collect()
     before = _reset(device)
     total = torch.stack([loss.float() for loss in network.losses(images, targets).values()]).sum()
@@ -83,7 +94,11 @@ def _reset(device: torch.device) -> int:
 
 
 def _used_at_most(device: torch.device) -> int:
-    return int(torch.cuda.max_memory_allocated(device)) if device.type == "cuda" else _kibibytes(_STATUS, "VmHWM")
+    return (
+        int(torch.cuda.max_memory_allocated(device))
+        if device.type == "cuda"
+        else _kibibytes(_STATUS, "VmHWM")
+    )
 
 
 def _free(device: torch.device) -> int:

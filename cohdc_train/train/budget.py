@@ -19,13 +19,19 @@ class FitTrainer(Trainer):
     """Lightning's Trainer with one more precision.
 
     Args:
-        precision: Lightning's, or "auto": bf16-mixed where GPU or CPU computes in it, 32-true elsewhere.
+        precision: Lightning's, or "auto": bf16-mixed where GPU or CPU computes in it, 32-true
+            elsewhere.
     """
 
     def __init__(
-        self, *args: Any, precision: _PRECISION_INPUT | Literal["auto"] | None = "auto", **kwargs: Any
+        self,
+        *args: Any,
+        precision: _PRECISION_INPUT | Literal["auto"] | None = "auto",
+        **kwargs: Any,
     ) -> None:
-        chosen = auto_precision(kwargs.get("accelerator", "auto")) if precision == "auto" else precision
+        chosen = (
+            auto_precision(kwargs.get("accelerator", "auto")) if precision == "auto" else precision
+        )
         super().__init__(*args, precision=chosen, **kwargs)
 
 
@@ -38,17 +44,22 @@ def auto_precision(accelerator: Any = "auto") -> _PRECISION_INPUT:
     return "bf16-mixed" if has_bf16 else "32-true"
 
 
-def training_limits(trainer: dict[str, Any], epochs: int | None, minutes: float | None) -> dict[str, Any]:
-    """Return the trainer's limits for `--epochs` and `--minutes`; whichever comes first ends the training.
+def training_limits(
+    trainer: dict[str, Any], epochs: int | None, minutes: float | None
+) -> dict[str, Any]:
+    """Return the trainer's limits for `--epochs` and `--minutes`; whichever comes first ends the
+    training.
 
-    trainer: arguments of the trainer, of which max_epochs, max_steps and max_time are read. Raises ValueError for a
-    budget that is not positive.
+    trainer: arguments of the trainer, of which max_epochs, max_steps and max_time are read. Raises
+    ValueError for a budget that is not positive.
     """
     if epochs is not None and epochs < 1:
         raise ValueError(f"--epochs {epochs}: at least 1")
     if minutes is not None and minutes <= 0:
         raise ValueError(f"--minutes {minutes:g}: must be above 0")
-    limits: dict[str, Any] = {name: trainer[name] for name in ("max_epochs", "max_steps", "max_time")}
+    limits: dict[str, Any] = {
+        name: trainer[name] for name in ("max_epochs", "max_steps", "max_time")
+    }
     if epochs is not None:
         limits["max_epochs"] = epochs
     if minutes is not None:
@@ -88,7 +99,9 @@ def _as_timedelta(value: Any) -> timedelta:
     if isinstance(value, str):
         parts = value.split(":")
         if len(parts) != 4 or not all(part.isdigit() for part in parts):
-            raise ValueError(f"--trainer.max_time {value}: give DD:HH:MM:SS, such as 00:00:10:00, or --minutes 10")
+            raise ValueError(
+                f"--trainer.max_time {value}: give DD:HH:MM:SS, such as 00:00:10:00, or --minutes 10"
+            )
         days, hours, minutes, seconds = (int(part) for part in parts)
         return timedelta(days=days, hours=hours, minutes=minutes, seconds=seconds)
     return timedelta(**value) if isinstance(value, dict) else value

@@ -20,7 +20,13 @@ from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path, model_path
 from cohdc_train.train.batch_size import largest_batch
-from cohdc_train.train.budget import FitTrainer, default_epochs, is_bounded, training_limits, validation_interval
+from cohdc_train.train.budget import (
+    FitTrainer,
+    default_epochs,
+    is_bounded,
+    training_limits,
+    validation_interval,
+)
 from cohdc_train.train.ema import ema
 from cohdc_train.train.initial_weights import (
     InitialWeights,
@@ -45,7 +51,8 @@ _DEFAULT_NETWORK = "networks/hdc_net_n.yaml"
 _NETWORK_NAMES = ("backbone", "depth")  # fields that say which network is meant
 _BEST = "val/segm_AP"
 _OVERFIT_STEPS = 300
-# Lightning's advice that does not apply here, and what its own code is told off for by newer packages.
+# Lightning's advice that does not apply here, and what its own code is told off for by newer
+# packages.
 _ADVICE = (
     ".*does not have many workers.*",
     ".*is smaller than the logging interval.*",
@@ -59,11 +66,13 @@ _ADVICE = (
 def fit(args: list[str]) -> Trainer:
     """Train: `cohdc fit DATA [--config FILE.yaml] [--minutes N | --epochs N] [--out DIR]`.
 
-    Writes below `--out`: `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved), `logs/version_N/` (CSV,
-    TensorBoard), `pictures/` (of best.ckpt; `pictures/last/` of the last validation; none with `--pictures false`).
+    Writes below `--out`: `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved),
+    `logs/version_N/` (CSV, TensorBoard), `pictures/` (of best.ckpt; `pictures/last/` of the last
+    validation; none with `--pictures false`).
 
     Raises:
-        CohdcError: in one line, for whatever the user can fix; a wrong key ends the program with code 2.
+        CohdcError: in one line, for whatever the user can fix; a wrong key ends the program with
+            code 2.
     """
     keep_freed_memory()
     with told_in_one_line():
@@ -76,7 +85,11 @@ def fit(args: list[str]) -> Trainer:
             seed_everything_default=0,
             save_config_callback=_SaveConfig,
             save_config_kwargs={"overwrite": True, "save_to_log_dir": False},
-            trainer_defaults={"gradient_clip_val": 5.0, "log_every_n_steps": 10, "check_val_every_n_epoch": None},
+            trainer_defaults={
+                "gradient_clip_val": 5.0,
+                "log_every_n_steps": 10,
+                "check_val_every_n_epoch": None,
+            },
             parser_kwargs={"prog": "cohdc fit", "usage": _USAGE, "description": _DESCRIPTION},
             auto_configure_optimizers=False,
         )
@@ -91,9 +104,18 @@ class FitCommand(LightningCLI):
     reporter: ProgressReporter
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Add this command's own options, the checkpoints, and what the network takes over from the data."""
-        parser.add_argument("--out", type=Path, default=Path("runs/fit"), help="folder for everything that is written")
-        parser.add_argument("--ckpt_path", type=Path | None, default=None, help="checkpoint of a training to resume")
+        """Add this command's own options, the checkpoints, and what the network takes over from the
+        data.
+        """
+        parser.add_argument(
+            "--out",
+            type=Path,
+            default=Path("runs/fit"),
+            help="folder for everything that is written",
+        )
+        parser.add_argument(
+            "--ckpt_path", type=Path | None, default=None, help="checkpoint of a training to resume"
+        )
         parser.add_argument(
             "--pretrained",
             type=str,
@@ -102,17 +124,32 @@ class FitCommand(LightningCLI):
             "weights), none, imagenet, a shipped network (person, person_s), or a file: checkpoint, exported ONNX, "
             "state dict of the backbone",
         )
-        parser.add_argument("--epochs", type=int | None, default=None, help="length of the training in epochs")
-        parser.add_argument("--minutes", type=float | None, default=None, help="length of the training in minutes")
         parser.add_argument(
-            "--ema", type=float, default=0.0, help="decay of the weights' moving average, such as .999; 0: none"
-        )
-        parser.add_argument("--pictures", type=bool, default=True, help="draw every validation, in OUT/pictures")
-        parser.add_argument(
-            "--lr_find", type=bool, default=False, help="try learning rates for 100 steps, suggest one, and stop"
+            "--epochs", type=int | None, default=None, help="length of the training in epochs"
         )
         parser.add_argument(
-            "--overfit", type=int, default=0, help="train and validate on N images alone, to check the labels; 0: no"
+            "--minutes", type=float | None, default=None, help="length of the training in minutes"
+        )
+        parser.add_argument(
+            "--ema",
+            type=float,
+            default=0.0,
+            help="decay of the weights' moving average, such as .999; 0: none",
+        )
+        parser.add_argument(
+            "--pictures", type=bool, default=True, help="draw every validation, in OUT/pictures"
+        )
+        parser.add_argument(
+            "--lr_find",
+            type=bool,
+            default=False,
+            help="try learning rates for 100 steps, suggest one, and stop",
+        )
+        parser.add_argument(
+            "--overfit",
+            type=int,
+            default=0,
+            help="train and validate on N images alone, to check the labels; 0: no",
         )
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults(
@@ -156,7 +193,9 @@ class FitCommand(LightningCLI):
         kwargs |= self._limits(config)
         if config["check_val_every_n_epoch"] is None and config["val_check_interval"] is None:
             kwargs |= validation_interval(kwargs)
-        elif config["check_val_every_n_epoch"] is None and isinstance(config["val_check_interval"], float):
+        elif config["check_val_every_n_epoch"] is None and isinstance(
+            config["val_check_interval"], float
+        ):
             kwargs["check_val_every_n_epoch"] = 1  # a share of an epoch
         if config["logger"] in (None, True):
             root = Path(self.config["out"])
@@ -166,7 +205,9 @@ class FitCommand(LightningCLI):
         return super().instantiate_trainer(**kwargs)
 
     def _limits(self, config: Any) -> dict[str, Any]:
-        """Return max_epochs, max_steps and max_time; without a budget, epochs by the number of images."""
+        """Return max_epochs, max_steps and max_time; without a budget, epochs by the number of
+        images.
+        """
         limits = training_limits(config, self.config["epochs"], self.config["minutes"])
         if self.config["overfit"] and not is_bounded(limits):
             return {**limits, "max_steps": _OVERFIT_STEPS, "max_epochs": -1}
@@ -179,7 +220,9 @@ class FitCommand(LightningCLI):
         return limits
 
     def _callbacks(self, config: Any) -> list[Callback]:
-        """Return the callbacks: progress bar, last.ckpt, moving average, figures, reports, and the user's own."""
+        """Return the callbacks: progress bar, last.ckpt, moving average, figures, reports, and the
+        user's own.
+        """
         out = Path(self.config["out"])
         given = self.config_init["trainer"]["callbacks"] or []
         bar = [] if config["enable_progress_bar"] is False else [RichProgressBar(leave=True)]
@@ -197,7 +240,9 @@ class FitCommand(LightningCLI):
         if self.initial.kind == "network":
             left = self.model.take_over(model_path(self.initial.source))
             if left:
-                rank_zero_info(f"not taken over, for other classes or another shape: {', '.join(left)}")
+                rank_zero_info(
+                    f"not taken over, for other classes or another shape: {', '.join(left)}"
+                )
         if self.datamodule.batch_size == "auto":
             self._choose_batch_size()
         body = self.model.network.backbone.body
@@ -212,7 +257,9 @@ class FitCommand(LightningCLI):
         self._summarize()
 
     def _validate_last_step(self) -> None:
-        """Score the last weights where no validation has, so that best.ckpt exists however the training ended."""
+        """Score the last weights where no validation has, so that best.ckpt exists however the
+        training ended.
+        """
         trainer, module = self.trainer, self.model
         if (
             self.config["trainer"]["fast_dev_run"]
@@ -230,22 +277,34 @@ class FitCommand(LightningCLI):
         """Print scores, hints, files and the next command."""
         if not self.trainer.is_global_zero or not self.reporter.history:
             return
-        facts = training_facts(self.model, self.datamodule, self.reporter, self.initial.kind == "random")
+        facts = training_facts(
+            self.model, self.datamodule, self.reporter, self.initial.kind == "random"
+        )
         if self.config["overfit"]:
             print(overfit_verdict(facts.scores, self.config["overfit"]))
             return
         best = self._best_checkpoint().best_model_score
-        for line in summary_lines(facts, Path(self.config["out"]), None if best is None else float(best)):
+        for line in summary_lines(
+            facts, Path(self.config["out"]), None if best is None else float(best)
+        ):
             print(line)
 
     def _best_checkpoint(self) -> ModelCheckpoint:
         """Return the callback that keeps best.ckpt."""
-        return next(c for c in self.trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint) and c.monitor)
+        return next(
+            c
+            for c in self.trainer.checkpoint_callbacks
+            if isinstance(c, ModelCheckpoint) and c.monitor
+        )
 
     def _choose_batch_size(self) -> None:
         if self.trainer.world_size > 1:
-            raise CohdcError("batch_size auto: works on one device; give the number it finds there to several")
-        self.datamodule.batch_size = largest_batch(self.model, self.datamodule, self.trainer.strategy.root_device)
+            raise CohdcError(
+                "batch_size auto: works on one device; give the number it finds there to several"
+            )
+        self.datamodule.batch_size = largest_batch(
+            self.model, self.datamodule, self.trainer.strategy.root_device
+        )
         print(f"batch size: {self.datamodule.batch_size}")
 
 
@@ -258,19 +317,25 @@ def _keep_last(folder: Path) -> ModelCheckpoint:
 
     ModelCheckpoint's own `save_last` writes it only when the best one changes.
     """
-    return LastCheckpoint(folder, "last", save_top_k=1, save_on_train_epoch_end=True, enable_version_counter=False)
+    return LastCheckpoint(
+        folder, "last", save_top_k=1, save_on_train_epoch_end=True, enable_version_counter=False
+    )
 
 
 class LastCheckpoint(ModelCheckpoint):
     """`last.ckpt`, also of a training that Ctrl-C or an error ended."""
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
         """Save where the training is, and say how it goes on."""
         if trainer.global_step == 0 or self.dirpath is None or isinstance(exception, CohdcError):
             return
         path = Path(self.dirpath) / "last.ckpt"
         trainer.save_checkpoint(path)
-        rank_zero_info(f"interrupted at step {trainer.global_step}; --ckpt_path {path} goes on from there")
+        rank_zero_info(
+            f"interrupted at step {trainer.global_step}; --ckpt_path {path} goes on from there"
+        )
 
 
 class _SaveConfig(SaveConfigCallback):
@@ -281,7 +346,9 @@ class _SaveConfig(SaveConfigCallback):
         root.mkdir(parents=True, exist_ok=True)
         config = self.config.clone()
         config["ckpt_path"] = None  # the file repeats a training, and does not resume one
-        self.parser.save(config, root / "config.yaml", skip_none=False, overwrite=True, multifile=False)
+        self.parser.save(
+            config, root / "config.yaml", skip_none=False, overwrite=True, multifile=False
+        )
 
 
 def _resolve_arguments(args: list[str]) -> list[str]:
@@ -310,7 +377,9 @@ def _resolve_arguments(args: list[str]) -> list[str]:
 
 def _names_network(args: list[str]) -> bool:
     """Return whether an option, or a config behind `--config`, says which backbone the network has."""
-    if any(arg.startswith(tuple(f"--model.network.{name}" for name in _NETWORK_NAMES)) for arg in args):
+    if any(
+        arg.startswith(tuple(f"--model.network.{name}" for name in _NETWORK_NAMES)) for arg in args
+    ):
         return True
     paths = [following for arg, following in pairwise(args) if arg in ("--config", "-c")]
     paths += [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
@@ -324,7 +393,9 @@ def _names_network(args: list[str]) -> bool:
 
 @contextmanager
 def told_in_one_line() -> Iterator[None]:
-    """Turn what a user can cause (bad values, files, a reader's error in a worker process) into a CohdcError."""
+    """Turn what a user can cause (bad values, files, a reader's error in a worker process) into a
+    CohdcError.
+    """
     with warnings.catch_warnings():
         for message in _ADVICE:
             warnings.filterwarnings("ignore", message)
@@ -334,6 +405,8 @@ def told_in_one_line() -> Iterator[None]:
             lines = str(error).strip().splitlines()
             last = lines[-1] if lines else "no message"
             # A worker process sends a traceback, whose last line is the error's name and message.
-            raise CohdcError((last.partition("Error: ")[2] or last) if len(lines) > 1 else last) from error
+            raise CohdcError(
+                (last.partition("Error: ")[2] or last) if len(lines) > 1 else last
+            ) from error
         except (MisconfigurationException, FileNotFoundError) as error:
             raise CohdcError(" ".join(str(error).split())) from error

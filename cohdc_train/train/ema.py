@@ -5,9 +5,11 @@ from torch import Tensor
 
 
 def ema(decay: float) -> WeightAveraging:
-    """Lightning's averaging, with a decay that grows towards `decay` so that the first steps are soon forgotten.
+    """Lightning's averaging, with a decay that grows towards `decay` so that the first steps are
+    soon forgotten.
 
-    After n updates it is min(decay, (1 + n) / (10 + n)). Raises ValueError for a decay outside 0..1.
+    After n updates it is min(decay, (1 + n) / (10 + n)). Raises ValueError for a decay outside
+    0..1.
     """
     if not 0 < decay < 1:
         raise ValueError(f"ema {decay}: a decay lies between 0 and 1, such as 0.999")

@@ -24,7 +24,13 @@ _GAP = 6  # px
 _NUMBER = (20, 14)  # px, width and height
 _FILL = 0.35
 # BGR, of objects found as the right class; red and orange are kept for mistakes
-_COLOURS: tuple[Colour, ...] = ((75, 180, 60), (230, 160, 30), (240, 240, 70), (200, 60, 160), (90, 220, 220))
+_COLOURS: tuple[Colour, ...] = (
+    (75, 180, 60),
+    (230, 160, 30),
+    (240, 240, 70),
+    (200, 60, 160),
+    (90, 220, 220),
+)
 _MISTAKE: Colour = (60, 60, 255)
 _WRONG_CLASS: Colour = (0, 150, 255)
 _CROWD: Colour = (255, 255, 255)
@@ -33,11 +39,17 @@ _PAPER = 28  # grey value of the background
 
 
 def draw_tiles(
-    title: str, matches: Sequence[ImageMatch], images: Mapping[int, CocoImage], names: Sequence[str], columns: int = 2
+    title: str,
+    matches: Sequence[ImageMatch],
+    images: Mapping[int, CocoImage],
+    names: Sequence[str],
+    columns: int = 2,
 ) -> bytes:
-    """A JPEG of images, each with its truth on the left, its prediction in the middle and a list on the right.
+    """A JPEG of images, each with its truth on the left, its prediction in the middle and a list on
+    the right.
 
-    An object and the detection that found it share number and colour; red: missed or false, orange: found as another
+    An object and the detection that found it share number and colour; red: missed or false, orange:
+    found as another
     class, white: crowd. images: by id. Raises DataError naming an image that cannot be read.
     """
     tiles = [_tile(match, images[match.image_id], names) for match in matches]
@@ -46,14 +58,18 @@ def draw_tiles(
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
     legend = "left: truth, middle: predicted at class score >= 0.5; same number: found; red: missed or false"
     head = _paper(3 * _LINE, columns * blank.shape[1])
-    for line, text in enumerate((title, legend + "; orange: other class; white: crowd; q: predicted quality")):
+    for line, text in enumerate(
+        (title, legend + "; orange: other class; white: crowd; q: predicted quality")
+    ):
         _write(head, text, (_GAP, (line + 1) * _LINE + 2), _INK, 0.5)
     picture = np.vstack([head, *rows])
     return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
 
 
 class _Entry(NamedTuple):
-    """A line of the list, and what carries its number. Misses have none: they share a line per class."""
+    """A line of the list, and what carries its number. Misses have none: they share a line per
+    class.
+    """
 
     text: str
     colour: Colour
@@ -74,9 +90,17 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
     right = int(match.right.sum())
     counts = f"objects {len(match.objects)}, found {right}, false {len(match.detections) - right}"
     head = _paper(_LINE, 2 * _PANEL[1] + _LIST + 3 * _GAP)
-    _write(head, f"score {match.score:.2f}   {counts}   {image.path.name}", (_GAP, _LINE - 5), _INK, 0.45)
+    _write(
+        head,
+        f"score {match.score:.2f}   {counts}   {image.path.name}",
+        (_GAP, _LINE - 5),
+        _INK,
+        0.45,
+    )
     gap = _paper(_PANEL[0], _GAP)
-    body = np.hstack([gap, _centred(truth), gap, _centred(predicted), gap, _list(match, entries, names)])
+    body = np.hstack(
+        [gap, _centred(truth), gap, _centred(predicted), gap, _list(match, entries, names)]
+    )
     return np.vstack([head, body, _paper(_GAP, body.shape[1])])
 
 
@@ -105,7 +129,11 @@ def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
         colour = _COLOURS[len(found) % len(_COLOURS)] if match.right[j] else _WRONG_CLASS
         seen = names[detection["category_id"] - 1]
         what = seen if match.right[j] else f"{seen}, is {name}"
-        found.append(_Entry(f"{what} {_values(detection)} IoU {match.overlaps[i, j]:.2f}", colour, o, detection))
+        found.append(
+            _Entry(
+                f"{what} {_values(detection)} IoU {match.overlaps[i, j]:.2f}", colour, o, detection
+            )
+        )
     false: list[_Entry] = []
     for i, row in enumerate(match.detections):
         if i not in match.found:
@@ -124,7 +152,9 @@ def _list(match: ImageMatch, entries: Sequence[_Entry], names: Sequence[str]) ->
     room = _PANEL[0] // _LINE
     missed = Counter(names[row["category_id"] - 1] for row in match.missed())
     lines = [(f"missed: {count} {name}", _MISTAKE) for name, count in missed.items()]
-    lines += [(f"{number} {entry.text}", entry.colour) for number, entry in enumerate(entries, start=1)]
+    lines += [
+        (f"{number} {entry.text}", entry.colour) for number, entry in enumerate(entries, start=1)
+    ]
     if len(lines) > room:
         lines[room - 1 :] = [(f"and {len(lines) - room + 1} more", _INK)]
     for k, (text, colour) in enumerate(lines):
@@ -135,12 +165,14 @@ def _list(match: ImageMatch, entries: Sequence[_Entry], names: Sequence[str]) ->
 def _mask(row: Row, shown: Image) -> Image:
     """A row's mask, [H, W] of 0 and 1, at the size at which its image is shown."""
     decoded = rle.decode(row["segmentation"])
-    return np.asarray(cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+    return np.asarray(
+        cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8
+    )
 
 
 def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
-    """(x, y) of a number's lower left corner: where the mask is widest, or just below or above when a number stands
-    there; None when there too."""
+    """(x, y) of a number's lower left corner: where the mask is widest, or just below or above when
+    a number stands there; None when there too."""
     depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     width, height = _NUMBER

@@ -19,7 +19,17 @@ SHIPPED = "person"  # the shipped network that networks of its layers start from
 _SHIPPED_CONFIG = "networks/hdc_net_n.yaml"
 _PUBLISHED = "IMAGENET1K_V1"
 # Fields of NetworkConfig that decide which layers there are, and their shapes.
-SHAPE_FIELDS = ("backbone", "depth", "width", "finest_stride", "fpn_channels", "fc", "cqe", "mask_size", "head_norm")
+SHAPE_FIELDS = (
+    "backbone",
+    "depth",
+    "width",
+    "finest_stride",
+    "fpn_channels",
+    "fc",
+    "cqe",
+    "mask_size",
+    "head_norm",
+)
 
 Network = Mapping[str, Any]  # the fields of NetworkConfig by name
 
@@ -29,8 +39,9 @@ class InitialWeights:
     """Where a training's first weights come from.
 
     Attributes:
-        kind: "network" is a checkpoint or exported file with weights of all layers, "backbone" a state dict of the
-            backbone alone, "random" none, "resumed" the checkpoint of an interrupted training.
+        kind: "network" is a checkpoint or exported file with weights of all layers, "backbone" a
+            state dict of the backbone alone, "random" none, "resumed" the checkpoint of an
+            interrupted training.
         source: file, or torchvision's name of published backbone weights; empty without weights.
         norm: norm of the backbone that these weights ask for: "frozen" or "batch".
         reason: one clause on why there are no better ones, for "random"; empty otherwise.
@@ -48,16 +59,21 @@ class InitialWeights:
         if self.kind == "random":
             warning = f"; {num_images} images are few for that" if num_images < FEW_IMAGES else ""
             return f"initial weights: random ({self.reason}){warning}"
-        named = {"network": "all layers of", "backbone": "backbone,", "resumed": "resumed from"}[self.kind]
+        named = {"network": "all layers of", "backbone": "backbone,", "resumed": "resumed from"}[
+            self.kind
+        ]
         return f"initial weights: {named} {self.source}"
 
 
-def choose_initial_weights(pretrained: str, network: Network, resumed: Path | None = None) -> InitialWeights:
+def choose_initial_weights(
+    pretrained: str, network: Network, resumed: Path | None = None
+) -> InitialWeights:
     """Choose the first weights of a training.
 
     Args:
-        pretrained: "auto" for the best that are known, "none" for random ones, "imagenet" for the backbone's published
-            ones, a shipped network's name, or a file: a checkpoint, an exported ONNX, a state dict of the backbone.
+        pretrained: "auto" for the best that are known, "none" for random ones, "imagenet" for the
+            backbone's published ones, a shipped network's name, or a file: a checkpoint, an
+            exported ONNX, a state dict of the backbone.
         network: fields of the network's config. `weights`, where it is given, is what "auto" takes.
         resumed: checkpoint of an interrupted training, which holds all weights.
 
@@ -67,7 +83,9 @@ def choose_initial_weights(pretrained: str, network: Network, resumed: Path | No
     if resumed is not None:
         stored = _read_weights(resumed)
         if "hyper_parameters" not in stored or "loops" not in stored:
-            raise CohdcError(f"{resumed}: not a checkpoint of cohdc fit; --pretrained takes weights of other kinds")
+            raise CohdcError(
+                f"{resumed}: not a checkpoint of cohdc fit; --pretrained takes weights of other kinds"
+            )
         return InitialWeights("resumed", str(resumed), stored=stored["hyper_parameters"])
     if pretrained == "none":
         return InitialWeights("random", norm="batch", reason="--pretrained none")
@@ -80,22 +98,31 @@ def choose_initial_weights(pretrained: str, network: Network, resumed: Path | No
     if _has_layers_of_shipped(network):
         return InitialWeights("network", SHIPPED)
     if network["width"] != 1.0:
-        return InitialWeights("random", norm="batch", reason="no weights are published for a backbone of this width")
+        return InitialWeights(
+            "random", norm="batch", reason="no weights are published for a backbone of this width"
+        )
     if network["backbone"] == "mobilenet_v1":
-        reason = "none are published for mobilenet_v1; --pretrained FILE.pth takes a local state dict"
+        reason = (
+            "none are published for mobilenet_v1; --pretrained FILE.pth takes a local state dict"
+        )
         return InitialWeights("random", norm="batch", reason=reason)
     return _published(network)
 
 
 def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]:
-    """Return the fields of the network that follow from its initial weights: weights, norm and frozen_stages.
+    """Return the fields of the network that follow from its initial weights: weights, norm and
+    frozen_stages.
 
     Raises CohdcError where a given norm cannot hold them.
     """
     if initial.kind == "resumed":
         stored = initial.stored.get("network", {})
         undecided = {"norm": "auto", "frozen_stages": None}
-        decided = {name: stored.get(name, network[name]) for name, value in undecided.items() if network[name] == value}
+        decided = {
+            name: stored.get(name, network[name])
+            for name, value in undecided.items()
+            if network[name] == value
+        }
         return {"weights": None, **decided}
     is_exported = initial.kind == "network" and model_path(initial.source).suffix == ".onnx"
     if is_exported and network["norm"] == "batch":
@@ -114,7 +141,9 @@ def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]
 
 
 def resolve_backbone_lr(initial: InitialWeights, backbone_lr: float | None) -> float:
-    """Return the learning rate of the backbone, as a share of the rest's, that the initial weights ask for."""
+    """Return the learning rate of the backbone, as a share of the rest's, that the initial weights
+    ask for.
+    """
     if backbone_lr is None and initial.kind == "resumed":
         backbone_lr = initial.stored.get("optimizer", {}).get("backbone_lr")
     config = OptimizerConfig(backbone_lr=backbone_lr).resolved(pretrained=initial.kind != "random")
@@ -147,19 +176,31 @@ def _of_file(pretrained: str) -> InitialWeights:
 
 
 def _read_weights(path: Path) -> dict[str, Any]:
-    """Read what `torch.save` wrote. Raises CohdcError naming the file when it is neither weights nor a checkpoint."""
+    """Read what `torch.save` wrote. Raises CohdcError naming the file when it is neither weights
+    nor a checkpoint.
+    """
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
-        raise CohdcError(f"{path}: neither a checkpoint nor a state dict ({type(error).__name__})") from error
+        raise CohdcError(
+            f"{path}: neither a checkpoint nor a state dict ({type(error).__name__})"
+        ) from error
     if not isinstance(stored, dict):
-        raise CohdcError(f"{path}: neither a checkpoint nor a state dict: it holds a {type(stored).__name__}")
+        raise CohdcError(
+            f"{path}: neither a checkpoint nor a state dict: it holds a {type(stored).__name__}"
+        )
     return stored
 
 
 def _has_layers_of_shipped(network: Network) -> bool:
-    """Return whether the shipped network's weights fit: the same layers of the same shapes, but for the classes."""
-    fields = yaml.safe_load(config_path(_SHIPPED_CONFIG).read_text(encoding="utf-8"))["model"]["network"]
+    """Return whether the shipped network's weights fit: the same layers of the same shapes, but for
+    the classes.
+    """
+    fields = yaml.safe_load(config_path(_SHIPPED_CONFIG).read_text(encoding="utf-8"))["model"][
+        "network"
+    ]
     shipped = NetworkConfig(**fields)
     names = [name for name in SHAPE_FIELDS if name != "depth" or network["backbone"] == "resnet"]
-    return network["norm"] != "batch" and all(network[name] == getattr(shipped, name) for name in names)
+    return network["norm"] != "batch" and all(
+        network[name] == getattr(shipped, name) for name in names
+    )

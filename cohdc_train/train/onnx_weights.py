@@ -1,4 +1,6 @@
-"""The weights of an exported file, back in a network: what a training can start from when no checkpoint is left."""
+"""The weights of an exported file, back in a network: what a training can start from when no
+checkpoint is left.
+"""
 
 import json
 import re
@@ -20,7 +22,9 @@ _OPERATORS = ("Conv", "ConvTranspose", "Gemm")
 
 
 def read_exported(path: Path) -> tuple[ModelProto, list[str]]:
-    """An ONNX file that `cohdc export` wrote, and its classes. Raises ValueError when it is none, OSError unread."""
+    """An ONNX file that `cohdc export` wrote, and its classes. Raises ValueError when it is none,
+    OSError unread.
+    """
     try:
         model = onnx.load(path)
     except DecodeError as error:
@@ -34,8 +38,8 @@ def read_exported(path: Path) -> tuple[ModelProto, list[str]]:
 def load_exported(network: MaskRCNN, model: ModelProto) -> None:
     """Put the weights of an exported file, quantised or not, into a network of the same shape.
 
-    A layer into which its norm was folded has lost its name; such layers are paired in the order in which they run.
-    Norms must be frozen here; they become the identity and a shift.
+    A layer into which its norm was folded has lost its name; such layers are paired in the order in
+    which they run. Norms must be frozen here; they become the identity and a shift.
     Raises ValueError when the layers do not agree, or a norm is one that is trained.
     """
     stored = _stored(model)
@@ -43,7 +47,10 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
     numbered = iter(sorted(key for key in stored if isinstance(key, int)))
     if len(layers) != len(stored):
         raise ValueError(f"the file has {len(stored)} layers, the network {len(layers)}")
-    norms = {getattr(module, name): getattr(module, norm) for module, name, norm in conv_norm_pairs(network)}
+    norms = {
+        getattr(module, name): getattr(module, norm)
+        for module, name, norm in conv_norm_pairs(network)
+    }
     own = dict(network.named_modules())
     for name in layers:
         key = name if name in stored else next(numbered, None)
@@ -53,14 +60,18 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
         layer = own[name]
         norm = norms.get(layer)
         if layer.weight.shape != weights.shape:
-            raise ValueError(f"layer {name} is {list(weights.shape)} in the file, {list(layer.weight.shape)} here")
+            raise ValueError(
+                f"layer {name} is {list(weights.shape)} in the file, {list(layer.weight.shape)} here"
+            )
         with torch.no_grad():
             layer.weight.copy_(weights)
             if norm is None:
                 layer.bias.copy_(bias)
                 continue
             if not isinstance(norm, FrozenNorm):
-                raise ValueError(f"the norm behind {name} is trained, and the file holds none; freeze it")
+                raise ValueError(
+                    f"the norm behind {name} is trained, and the file holds none; freeze it"
+                )
             norm.weight.fill_(1)
             norm.running_mean.zero_()
             norm.running_var.fill_(1 - norm.eps)
@@ -68,7 +79,9 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
 
 
 def _running(network: MaskRCNN) -> list[str]:
-    """Names of the layers in the order in which they first run, the mask and CQE heads' without a detection too."""
+    """Names of the layers in the order in which they first run, the mask and CQE heads' without a
+    detection too.
+    """
     names: list[str] = []
     copy = fused(network)
     for name, module in copy.named_modules():
@@ -79,7 +92,9 @@ def _running(network: MaskRCNN) -> list[str]:
 
 
 def _stored(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:
-    """Weights and bias of every layer, by its name, or by the number that the exporter gave it in its order."""
+    """Weights and bias of every layer, by its name, or by the number that the exporter gave it in
+    its order.
+    """
     tensors = {one.name: one for one in model.graph.initializer}
     makers = {name: node for node in model.graph.node for name in node.output}
     found: dict[str | int, tuple[Tensor, Tensor]] = {}

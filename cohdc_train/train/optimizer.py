@@ -22,8 +22,9 @@ Progress = Callable[[int], float]  # step -> share of the training budget that i
 class OptimizerConfig:
     """Optimizer and learning rate: linear warm-up times half a cosine over the training budget.
 
-    The budget is what ends the training: epochs, steps or minutes. The rate is a continuous function of the share of
-    it that is used, so it neither jumps at the end of the warm-up nor when a clock takes over from the steps.
+    The budget is what ends the training: epochs, steps or minutes. The rate is a continuous
+    function of the share of it that is used, so it neither jumps at the end of the warm-up nor when
+    a clock takes over from the steps.
 
     Attributes:
         name: "sgd" or "adamw".
@@ -33,8 +34,8 @@ class OptimizerConfig:
         warmup_ratio: share of the budget over which the rate rises from 0.
         warmup_steps: length of the warm-up in steps instead; None takes warmup_ratio.
         final_fraction: share of lr left at the end; 1 keeps it constant after the warm-up.
-        backbone_lr: learning rate of the backbone as a share of lr; None is 0.2 with trained initial weights, and 1
-            without.
+        backbone_lr: learning rate of the backbone as a share of lr; None is 0.2 with trained
+            initial weights, and 1 without.
         frozen_steps: steps at the beginning in which the backbone is not trained.
     """
 
@@ -50,16 +51,22 @@ class OptimizerConfig:
 
     def __post_init__(self) -> None:
         if self.lr <= 0 or not 0 <= self.final_fraction <= 1:
-            raise ValueError(f"lr {self.lr} must be above 0 and final_fraction {self.final_fraction} in 0..1")
+            raise ValueError(
+                f"lr {self.lr} must be above 0 and final_fraction {self.final_fraction} in 0..1"
+            )
         if not 0 <= self.warmup_ratio < 1 or (self.warmup_steps or 0) < 0:
             raise ValueError(
                 f"warmup_ratio {self.warmup_ratio} must be in 0..1 and warmup_steps {self.warmup_steps} not negative"
             )
         if (self.backbone_lr or 0) < 0 or self.frozen_steps < 0:
-            raise ValueError(f"backbone_lr {self.backbone_lr} or frozen_steps {self.frozen_steps} is negative")
+            raise ValueError(
+                f"backbone_lr {self.backbone_lr} or frozen_steps {self.frozen_steps} is negative"
+            )
 
     def resolved(self, pretrained: bool) -> "OptimizerConfig":
-        """Return a copy in which backbone_lr is decided. pretrained: the backbone's initial weights are trained."""
+        """Return a copy in which backbone_lr is decided. pretrained: the backbone's initial weights
+        are trained.
+        """
         if self.backbone_lr is not None:
             return self
         return replace(self, backbone_lr=PRETRAINED_BACKBONE_LR if pretrained else 1.0)
@@ -73,10 +80,14 @@ class OptimizerConfig:
         """
         progress = min(1.0, max(0.0, progress))
         cosine = 0.5 * (1 + math.cos(math.pi * progress))
-        return self._warmup(step, progress) * (self.final_fraction + (1 - self.final_fraction) * cosine)
+        return self._warmup(step, progress) * (
+            self.final_fraction + (1 - self.final_fraction) * cosine
+        )
 
     def _warmup(self, step: int, progress: float) -> float:
-        """Return the share of the warm-up that is over, 0..1; never 0, so that the first step trains too."""
+        """Return the share of the warm-up that is over, 0..1; never 0, so that the first step
+        trains too.
+        """
         if self.warmup_steps is not None:
             return min(1.0, (step + 1) / (self.warmup_steps + 1))
         if self.warmup_ratio == 0:
@@ -89,14 +100,20 @@ def build_optimizer(
 ) -> tuple[torch.optim.Optimizer, LambdaLR]:
     """Build the optimizer of a network's trainable parameters, and its schedule.
 
-    Weights and the rest (biases, norms) of the backbone and of what surrounds it are four groups. The learning rate of
-    a backbone that is not trained yet is 0: its gradients exist, so that every rank of a distributed run has them.
+    Weights and the rest (biases, norms) of the backbone and of what surrounds it are four groups.
+    The learning rate of a backbone that is not trained yet is 0: its gradients exist, so that every
+    rank of a distributed run has them.
     """
     backbone_share = 1.0 if config.backbone_lr is None else config.backbone_lr
     groups: list[dict[str, object]] = []
     factors: list[Callable[[int], float]] = []
     for name, share, frozen_steps, parameters in (
-        ("heads", 1.0, 0, [p for name, p in network.named_parameters() if not name.startswith("backbone.body.")]),
+        (
+            "heads",
+            1.0,
+            0,
+            [p for name, p in network.named_parameters() if not name.startswith("backbone.body.")],
+        ),
         (
             "backbone",
             backbone_share,
@@ -105,11 +122,17 @@ def build_optimizer(
         ),
     ):
         for weights in (True, False):
-            chosen: list[Tensor] = [p for p in parameters if p.requires_grad and (p.ndim > 1) == weights]
+            chosen: list[Tensor] = [
+                p for p in parameters if p.requires_grad and (p.ndim > 1) == weights
+            ]
             if chosen:
                 decay = config.weight_decay if weights else 0.0
                 groups.append(
-                    {"params": chosen, "weight_decay": decay, "name": f"{name}_{'weights' if weights else 'biases'}"}
+                    {
+                        "params": chosen,
+                        "weight_decay": decay,
+                        "name": f"{name}_{'weights' if weights else 'biases'}",
+                    }
                 )
                 factors.append(_group_factor(config, progress, share, frozen_steps))
     optimizer: torch.optim.Optimizer
@@ -132,7 +155,8 @@ def _group_factor(
 
 
 def training_progress(trainer: Trainer, total_steps: float) -> Progress | None:
-    """Return the share of the budget that is used at a step: of the steps or of `max_time`, whichever is further.
+    """Return the share of the budget that is used at a step: of the steps or of `max_time`,
+    whichever is further.
 
     total_steps: steps until max_epochs or max_steps; infinite where only time ends the training.
     Every process of a distributed run gets the same value. None for a training without an end.

@@ -1,4 +1,6 @@
-"""How a training goes: images per second, time left, learning rates, and one line after each validation."""
+"""How a training goes: images per second, time left, learning rates, and one line after each
+validation.
+"""
 
 import time
 from collections import deque
@@ -20,7 +22,8 @@ _SHOWN = "worst.jpg"  # validation image that goes to TensorBoard
 
 
 class ProgressReporter(pl.Callback):
-    """Logs learning rates, images per second and time left, and prints a line after each validation.
+    """Logs learning rates, images per second and time left, and prints a line after each
+    validation.
 
     Attributes:
         losses: total loss of every step so far.
@@ -44,11 +47,18 @@ class ProgressReporter(pl.Callback):
         """Start the clock."""
         self._started = time.monotonic()
         self._progress = pl_module.progress if isinstance(pl_module, MaskRCNNModule) else None
-        self._progress_before = 0.0 if self._progress is None else self._progress(trainer.global_step)
+        self._progress_before = (
+            0.0 if self._progress is None else self._progress(trainer.global_step)
+        )
         self._stamps.append((self._started, self.images_seen))
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Log speed, time left and learning rates."""
         size = len(batch.targets)
@@ -71,7 +81,11 @@ class ProgressReporter(pl.Callback):
         """Print where the training is."""
         lost = time.monotonic() - self._paused
         self._stamps = deque(((stamp + lost, seen) for stamp, seen in self._stamps), maxlen=_WINDOW)
-        if trainer.sanity_checking or not isinstance(pl_module, MaskRCNNModule) or pl_module.results is None:
+        if (
+            trainer.sanity_checking
+            or not isinstance(pl_module, MaskRCNNModule)
+            or pl_module.results is None
+        ):
             return
         self.history.append(pl_module.results.scores)
         self._print(self.line(trainer, pl_module.results.scores))
@@ -126,20 +140,26 @@ class ProgressReporter(pl.Callback):
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger) and image is not None:
                 rgb = np.ascontiguousarray(image[:, :, ::-1])
-                logger.experiment.add_image("val/worst", rgb, trainer.global_step, dataformats="HWC")
+                logger.experiment.add_image(
+                    "val/worst", rgb, trainer.global_step, dataformats="HWC"
+                )
 
 
 def _per_class(scores: dict[str, float]) -> str:
     """Return mask AP of the first few classes in brackets; nothing for a single class."""
     prefix = "segm_AP/"
-    classes = [(name.removeprefix(prefix), ap) for name, ap in scores.items() if name.startswith(prefix)]
+    classes = [
+        (name.removeprefix(prefix), ap) for name, ap in scores.items() if name.startswith(prefix)
+    ]
     shown = ", ".join(f"{name} {ap:.3f}" for name, ap in classes[:_CLASSES])
     rest = ", ..." if len(classes) > _CLASSES else ""
     return f" ({shown}{rest})" if classes else ""
 
 
 def learning_rates(trainer: pl.Trainer) -> dict[str, float]:
-    """Return the present learning rates: lr/heads of the heads, lr/backbone where the backbone is trained."""
+    """Return the present learning rates: lr/heads of the heads, lr/backbone where the backbone is
+    trained.
+    """
     rates: dict[str, float] = {}
     for optimizer in trainer.optimizers:
         for group in optimizer.param_groups:

@@ -1,4 +1,6 @@
-"""Checks of minutes before a training of hours: a learning-rate range test, and a few images learned by heart."""
+"""Checks of minutes before a training of hours: a learning-rate range test, and a few images
+learned by heart.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,17 +28,26 @@ def find_learning_rate(
     """
     lowest, highest = _RANGE
     finder = Tuner(trainer).lr_find(
-        module, datamodule=data, min_lr=lowest, max_lr=highest, num_training=_STEPS, update_attr=False
+        module,
+        datamodule=data,
+        min_lr=lowest,
+        max_lr=highest,
+        num_training=_STEPS,
+        update_attr=False,
     )
     rates, losses = ([], []) if finder is None else (finder.results["lr"], finder.results["loss"])
     suggestion = suggest_rate(rates, losses)
     if suggestion is None:
-        print("lr find: the loss hardly falls at any rate; keep the default, or check the labels with --overfit 8")
+        print(
+            "lr find: the loss hardly falls at any rate; keep the default, or check the labels with --overfit 8"
+        )
         return
     out.mkdir(parents=True, exist_ok=True)
     plot = out / "lr_find.png"
     write_bytes(plot, plot_lr_find(rates, losses, suggestion))
-    print(f"lr find: --model.optimizer.lr {suggestion:.1e}, a tenth of the rate of the lowest loss ({plot})")
+    print(
+        f"lr find: --model.optimizer.lr {suggestion:.1e}, a tenth of the rate of the lowest loss ({plot})"
+    )
 
 
 def suggest_rate(rates: Sequence[float], losses: Sequence[float]) -> float | None:

@@ -1,4 +1,6 @@
-"""What the end of a training says: scores, files, the next command, and hints where something is off."""
+"""What the end of a training says: scores, files, the next command, and hints where something is
+off.
+"""
 
 import math
 from collections import Counter
@@ -47,7 +49,9 @@ class TrainingFacts:
     canvas: tuple[int, int]
 
     def small_ratio(self) -> float:
-        """Return the share of training objects that are smaller on the canvas than half the smallest anchor."""
+        """Return the share of training objects that are smaller on the canvas than half the
+        smallest anchor.
+        """
         limit = min(self.network.anchor_scales) / 2
         sides = [side for image in self.images for side in _sides_on_canvas(image, self.canvas)]
         return sum(side < limit for side in sides) / max(1, len(sides))
@@ -68,9 +72,15 @@ def hints(facts: TrainingFacts) -> list[str]:
 def training_facts(
     module: MaskRCNNModule, data: CocoDataModule, reporter: ProgressReporter, random_weights: bool
 ) -> TrainingFacts:
-    """Collect what the summary and its hints say of a finished training; its best validation is scored."""
-    best = max(reporter.history, key=lambda scores: (not math.isnan(scores["segm_AP"]), scores["segm_AP"]))
-    counts = Counter(o.label for image in data.folder.val.images for o in image.objects if not o.crowd)
+    """Collect what the summary and its hints say of a finished training; its best validation is
+    scored.
+    """
+    best = max(
+        reporter.history, key=lambda scores: (not math.isnan(scores["segm_AP"]), scores["segm_AP"])
+    )
+    counts = Counter(
+        o.label for image in data.folder.val.images for o in image.objects if not o.crowd
+    )
     images = [image for split in data.folder.train for image in split.images]
     return TrainingFacts(
         scores=best,
@@ -90,20 +100,28 @@ def summary_lines(facts: TrainingFacts, out: Path, best_ap: float | None = None)
     out: its folder; best_ap: mask AP of best.ckpt, which may be of an earlier session.
     """
     scores = facts.scores
-    lines = [f"best.ckpt: mask AP {scores['segm_AP']:.3f}, AP50 {scores['segm_AP50']:.3f} on the validation split"]
+    lines = [
+        f"best.ckpt: mask AP {scores['segm_AP']:.3f}, AP50 {scores['segm_AP50']:.3f} on the validation split"
+    ]
     per_class = [
-        f"{name} {scores[f'segm_AP/{name}']:.3f}" for name in facts.class_counts if f"segm_AP/{name}" in scores
+        f"{name} {scores[f'segm_AP/{name}']:.3f}"
+        for name in facts.class_counts
+        if f"segm_AP/{name}" in scores
     ]
     if per_class:
         lines.append(f"mask AP per class: {', '.join(per_class)}")
     lines += [f"hint: {hint}" for hint in hints(facts)]
     if best_ap is not None and best_ap > scores["segm_AP"] + 1e-6:
-        lines[0] = f"best.ckpt: mask AP {best_ap:.3f}, of an earlier session; this one reached {scores['segm_AP']:.3f}"
+        lines[0] = (
+            f"best.ckpt: mask AP {best_ap:.3f}, of an earlier session; this one reached {scores['segm_AP']:.3f}"
+        )
     files = [name for name in _FILES if (out / name).exists()]
     if files:
         lines.append(f"files in {out}: {', '.join(files)}")
     if "best.ckpt" in files:
-        lines.append(f"next: cohdc export {out / 'best.ckpt'} --images {facts.images[0].path.parent}")
+        lines.append(
+            f"next: cohdc export {out / 'best.ckpt'} --images {facts.images[0].path.parent}"
+        )
     return lines
 
 

@@ -1,4 +1,6 @@
-"""Pictures of a validation: image grids, precision-recall, calibration, confusion; and of a training's log."""
+"""Pictures of a validation: image grids, precision-recall, calibration, confusion; and of a
+training's log.
+"""
 
 import traceback
 from collections.abc import Callable, Iterable, Mapping
@@ -32,15 +34,18 @@ _SCORE = "score = sum of mask IoU of the objects found / (objects + false detect
 def draw_validation(results: Results, images: Iterable[CocoImage]) -> dict[str, bytes]:
     """File name -> content of a validation's pictures.
 
-    best.jpg, worst.jpg: the images predicted best and worst, by `ImageMatch.score`; pr_curves.png, calibration.png,
-    confusion.png. images: of the validation split. Raises DataError naming an image that cannot be read.
+    best.jpg, worst.jpg: the images predicted best and worst, by `ImageMatch.score`; pr_curves.png,
+    calibration.png, confusion.png. images: of the validation split. Raises DataError naming an
+    image that cannot be read.
     """
     matches = match_images(results)
     by_id = {image.id: image for image in images}
     names = category_names(results.truth)
     best, worst = ranked(matches, _IMAGES)
     files = {
-        f"{which}.jpg": draw_tiles(f"{which} of {len(matches)} validation images; {_SCORE}", chosen, by_id, names)
+        f"{which}.jpg": draw_tiles(
+            f"{which} of {len(matches)} validation images; {_SCORE}", chosen, by_id, names
+        )
         for which, chosen in (("best", best), ("worst", worst))
     }
     counts = confusion_matrix(matches, len(names))
@@ -59,8 +64,8 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 class ValidationPictures(Callback):
-    """Draws during a training: `folder` holds pictures of the validation that best.ckpt is from and the losses so far,
-    `folder/last` those of the last validation.
+    """Draws during a training: `folder` holds pictures of the validation that best.ckpt is from and
+    the losses so far, `folder/last` those of the last validation.
 
     A picture that cannot be drawn is a warning with its traceback, never the end of a training.
     """
@@ -99,8 +104,8 @@ class ValidationPictures(Callback):
 
 
 def _is_best(trainer: Trainer) -> bool:
-    """Whether the checkpoint that watches a score, and is written after this, will take this validation for the best;
-    without one every validation is."""
+    """Whether the checkpoint that watches a score, and is written after this, will take this
+    validation for the best; without one every validation is."""
     for checkpoint in trainer.checkpoint_callbacks:
         if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor is not None:
             best = checkpoint.best_model_score
@@ -114,4 +119,6 @@ def _attempt(draw: Callable[[], None]) -> None:
     try:
         draw()
     except Exception:
-        rank_zero_warn(f"no pictures of this validation; the training goes on\n{traceback.format_exc()}")
+        rank_zero_warn(
+            f"no pictures of this validation; the training goes on\n{traceback.format_exc()}"
+        )

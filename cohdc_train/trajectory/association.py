@@ -8,10 +8,12 @@ from cohdc_train.trajectory.trajectory import FloatArray, Trajectory
 
 
 def associate(a: FloatArray, b: FloatArray, max_difference: float = 0.02) -> NDArray[np.int64]:
-    """Pairs of stamps at most `max_difference` s apart, each stamp used once, the nearest pairs chosen first.
+    """Pairs of stamps at most `max_difference` s apart, each stamp used once, the nearest pairs
+    chosen first.
 
-    a: [n], b: [m], strictly increasing, s. Returns [k, 2] indices into a and b, both columns increasing. The rule is
-    that of the TUM benchmark's associate tool, except that two pairs which would cross in time are uncrossed.
+    a: [n], b: [m], strictly increasing, s. Returns [k, 2] indices into a and b, both columns
+    increasing. The rule is that of the TUM benchmark's associate tool, except that two pairs which
+    would cross in time are uncrossed.
     """
     first = np.searchsorted(b, a - max_difference, side="left")
     counts = np.searchsorted(b, a + max_difference, side="right") - first
@@ -27,11 +29,14 @@ def associate(a: FloatArray, b: FloatArray, max_difference: float = 0.02) -> NDA
     return np.sort(np.array(pairs, dtype=np.int64).reshape(-1, 2), axis=0)
 
 
-def match(groundtruth: Trajectory, estimate: Trajectory, max_difference: float = 0.02) -> tuple[Trajectory, Trajectory]:
+def match(
+    groundtruth: Trajectory, estimate: Trajectory, max_difference: float = 0.02
+) -> tuple[Trajectory, Trajectory]:
     """Both trajectories cut down to their associated poses, row by row; each keeps its own stamps.
 
-    Distinct stamps are associated; a row of the estimate that repeats a stamp is matched as that stamp is, as evo does.
-    Raises DataError when fewer than three poses match: nothing could be aligned.
+    Distinct stamps are associated; a row of the estimate that repeats a stamp is matched as that
+    stamp is, as evo does. Raises DataError when fewer than three poses match: nothing could be
+    aligned.
     """
     truth_stamps, truth_rows = np.unique(groundtruth.stamps, return_index=True)
     stamps, stamp_of_row = np.unique(estimate.stamps, return_inverse=True)
@@ -41,12 +46,18 @@ def match(groundtruth: Trajectory, estimate: Trajectory, max_difference: float =
     partner = partner[stamp_of_row]
     matched = np.flatnonzero(partner >= 0)
     if len(matched) < 3:
-        raise DataError(f"{len(matched)} of {len(estimate)} poses lie within {max_difference} s of the ground truth")
+        raise DataError(
+            f"{len(matched)} of {len(estimate)} poses lie within {max_difference} s of the ground truth"
+        )
     return groundtruth.take(partner[matched]), estimate.take(matched)
 
 
 def nearest(stamps: FloatArray, wanted: FloatArray) -> NDArray[np.int64]:
-    """Return the row of the stamp nearest to each wanted time. stamps: [n], rising, s; wanted: [m], s."""
+    """Return the row of the stamp nearest to each wanted time. stamps: [n], rising, s; wanted: [m],
+    s.
+    """
     after = np.minimum(np.searchsorted(stamps, wanted), len(stamps) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(np.abs(wanted - stamps[before]) <= np.abs(stamps[after] - wanted), before, after)
+    return np.where(
+        np.abs(wanted - stamps[before]) <= np.abs(stamps[after] - wanted), before, after
+    )

@@ -1,7 +1,8 @@
-"""Camera trajectories: TUM text files, association, rigid alignment, ATE and RPE with six statistics (numpy).
+"""Camera trajectories: TUM text files, association, rigid alignment, ATE and RPE with six
+statistics (numpy).
 
-A trajectory file of the TUM RGB-D benchmark has one pose per line: `stamp tx ty tz qx qy qz qw`, seconds, metres and a
-unit quaternion, camera to world. Lines that begin with # are comments.
+A trajectory file of the TUM RGB-D benchmark has one pose per line: `stamp tx ty tz qx qy qz qw`,
+seconds, metres and a unit quaternion, camera to world. Lines that begin with # are comments.
 """
 
 import logging
@@ -23,8 +24,9 @@ _LOG = logging.getLogger(__name__)
 class Trajectory:
     """Poses of a camera over time.
 
-    stamps: [n] float64, s, never falling (files with repeated rows exist); poses: [n, 4, 4] float64, T_wc camera to
-    world, m. Raises ValueError when the shapes, the order of the stamps or a rotation is wrong.
+    stamps: [n] float64, s, never falling (files with repeated rows exist); poses: [n, 4, 4]
+    float64, T_wc camera to world, m. Raises ValueError when the shapes, the order of the stamps or
+    a rotation is wrong.
     """
 
     stamps: FloatArray
@@ -35,7 +37,9 @@ class Trajectory:
         object.__setattr__(self, "stamps", stamps)
         object.__setattr__(self, "poses", poses)
         if stamps.ndim != 1 or poses.shape != (len(stamps), 4, 4):
-            raise ValueError(f"stamps {stamps.shape} and poses {poses.shape} are not [n] and [n, 4, 4]")
+            raise ValueError(
+                f"stamps {stamps.shape} and poses {poses.shape} are not [n] and [n, 4, 4]"
+            )
         if not (np.isfinite(stamps).all() and np.isfinite(poses).all()):
             raise ValueError("a stamp or a pose is not finite")
         if (np.diff(stamps) < 0).any():
@@ -67,8 +71,8 @@ def read_tum(path: Path) -> Trajectory:
     """Read a TUM trajectory file; commas count as spaces, blank lines and # comments are skipped.
 
     Rows that repeat a stamp (real files hold them) are kept, and a warning is logged.
-    Raises DataError with the file and the line for a row that is not eight finite numbers, a quaternion of nearly no
-    length, or a stamp earlier than the one before it: nothing is sorted.
+    Raises DataError with the file and the line for a row that is not eight finite numbers, a
+    quaternion of nearly no length, or a stamp earlier than the one before it: nothing is sorted.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -80,7 +84,9 @@ def read_tum(path: Path) -> Trajectory:
             continue
         rows.append(_row(line, f"{path}:{number}"))
         if len(rows) > 1 and rows[-1][0] < rows[-2][0]:
-            raise DataError(f"{path}:{number}: stamp {rows[-1][0]!r} is earlier than {rows[-2][0]!r} before it")
+            raise DataError(
+                f"{path}:{number}: stamp {rows[-1][0]!r} is earlier than {rows[-2][0]!r} before it"
+            )
     if not rows:
         raise DataError(f"{path}: holds no pose")
     from scipy.spatial.transform import Rotation
@@ -114,7 +120,9 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
     quaternions = Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_quat(canonical=True)
     rows = ["# timestamp tx ty tz qx qy qz qw"]
-    for stamp, values in zip(trajectory.stamps, np.hstack([trajectory.positions, quaternions]), strict=True):
+    for stamp, values in zip(
+        trajectory.stamps, np.hstack([trajectory.positions, quaternions]), strict=True
+    ):
         time = np.format_float_positional(stamp, trim="0", min_digits=6)
         rows.append(" ".join([time, *(f"{value:.10f}" for value in values)]))
     write_text(path, "\n".join(rows) + "\n")

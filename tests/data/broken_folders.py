@@ -1,4 +1,6 @@
-"""Toy folders, each broken in one way on purpose: the finding that has to name it, and whether a mend saves it."""
+"""Toy folders, each broken in one way on purpose: the finding that has to name it, and whether a
+mend saves it.
+"""
 
 import copy
 import shutil
@@ -17,7 +19,9 @@ Change = Callable[[dict[str, Any], Path], None]
 
 
 class Broken(NamedTuple):
-    """change: breaks the training split's dict or files below the root; kind: the finding; mended: `--fix` saves it."""
+    """change: breaks the training split's dict or files below the root; kind: the finding; mended:
+    `--fix` saves it.
+    """
 
     change: Change
     kind: str
@@ -52,7 +56,9 @@ def _cut(path: Path) -> None:
 
 
 def _jpeg(turned: int = 1, mode: str = "RGB", cut: int = 0) -> Change:
-    """Replace the first training image by a JPEG with an EXIF orientation, of a mode, or cut at its end."""
+    """Replace the first training image by a JPEG with an EXIF orientation, of a mode, or cut at its
+    end.
+    """
 
     def change(content: dict[str, Any], root: Path) -> None:
         row = content["images"][0]
@@ -68,7 +74,9 @@ def _jpeg(turned: int = 1, mode: str = "RGB", cut: int = 0) -> Change:
 
 
 def _turned_by_exif(content: dict[str, Any], root: Path) -> None:
-    """The annotations are drawn on the picture as viewers show it: HEIGHT x WIDTH; the pixels lie on their side."""
+    """The annotations are drawn on the picture as viewers show it: HEIGHT x WIDTH; the pixels lie
+    on their side.
+    """
     row = content["images"][0]
     picture = Image.open(root / "images" / row["file_name"]).transpose(Image.Transpose.ROTATE_90)
     exif = Image.Exif()
@@ -147,15 +155,21 @@ _CROSSING = [[5, 5, 25, 25, 25, 5, 5, 30]]
 
 BROKEN: dict[str, Broken] = {
     "category without a name": Broken(_add("categories", {"id": 30}), "category-broken"),
-    "category id for two names": Broken(_add("categories", {"id": 10, "name": "cart"}), "category-id-twice"),
+    "category id for two names": Broken(
+        _add("categories", {"id": 10, "name": "cart"}), "category-id-twice"
+    ),
     "two ids for one name": Broken(_second_person, "category-name-twice"),
-    "category nobody uses": Broken(_add("categories", {"id": 30, "name": "cart"}), "classes-differ", mended=False),
+    "category nobody uses": Broken(
+        _add("categories", {"id": 30, "name": "cart"}), "classes-differ", mended=False
+    ),
     "class of one split only": Broken(_class_only_in_train, "classes-differ", mended=False),
     "image without a width": Broken(lambda c, r: c["images"][0].pop("width"), "image-broken"),
     "image id twice": Broken(_again("images", file_name="train_2.png"), "image-id-twice"),
     "image file listed twice": Broken(_listed_twice, "image-listed-twice"),
     "image file missing": Broken(_file(Path.unlink), "image-missing"),
-    "image file of text": Broken(_file(lambda path: path.write_text("<html>404</html>")), "image-corrupt"),
+    "image file of text": Broken(
+        _file(lambda path: path.write_text("<html>404</html>")), "image-corrupt"
+    ),
     "image file empty": Broken(_file(lambda path: path.write_bytes(b"")), "image-corrupt"),
     "PNG cut": Broken(_file(_cut), "image-truncated"),
     "JPEG cut": Broken(_jpeg(cut=300), "image-truncated"),
@@ -167,7 +181,8 @@ BROKEN: dict[str, Broken] = {
     "image resized, annotations not": Broken(_resized, "image-size"),
     "image of 48 megapixels": Broken(_huge, "image-huge"),
     "image without objects": Broken(
-        _add("images", {"id": 50, "file_name": "train_2.png", "width": WIDTH, "height": HEIGHT}), "image-listed-twice"
+        _add("images", {"id": 50, "file_name": "train_2.png", "width": WIDTH, "height": HEIGHT}),
+        "image-listed-twice",
     ),
     "500 objects in an image": Broken(_many, "image-crowded"),
     "annotation of text": Broken(_add("annotations", "person"), "annotation-broken"),
@@ -182,23 +197,39 @@ BROKEN: dict[str, Broken] = {
     "RLE without counts": Broken(_set(0, segmentation={"size": [HEIGHT, WIDTH]}), "contour-format"),
     "polygon not in a list": Broken(_flat, "contour-flat"),
     "polygon of two points": Broken(_set(0, segmentation=[[3, 4, 19, 28]]), "contour-short"),
-    "polygon of an odd count": Broken(_set(0, segmentation=[[3, 4, 19, 4, 19, 28, 3]]), "contour-odd"),
-    "polygon with NaN": Broken(_set(0, segmentation=[[3, 4, 19, 4, float("nan"), 28]]), "contour-number"),
-    "polygon with infinity": Broken(_set(0, segmentation=[[3, 4, 19, 4, float("inf"), 28]]), "contour-number"),
-    "polygon to the moon": Broken(_set(0, segmentation=[[3, 4, 1e9, 4, 19, 28]], bbox=None), "contour-outside"),
+    "polygon of an odd count": Broken(
+        _set(0, segmentation=[[3, 4, 19, 4, 19, 28, 3]]), "contour-odd"
+    ),
+    "polygon with NaN": Broken(
+        _set(0, segmentation=[[3, 4, 19, 4, float("nan"), 28]]), "contour-number"
+    ),
+    "polygon with infinity": Broken(
+        _set(0, segmentation=[[3, 4, 19, 4, float("inf"), 28]]), "contour-number"
+    ),
+    "polygon to the moon": Broken(
+        _set(0, segmentation=[[3, 4, 1e9, 4, 19, 28]], bbox=None), "contour-outside"
+    ),
     "polygon of which a part is broken": Broken(
         _set(0, segmentation=[[3, 4, 19, 4, 19, 28, 3, 28], [5, 5, 9, 9]]), "contour-short"
     ),
-    "polygon on a line": Broken(_set(0, segmentation=[[3, 4, 9, 4, 19, 4]], bbox=[3, 4, 16, 1]), "contour-empty"),
+    "polygon on a line": Broken(
+        _set(0, segmentation=[[3, 4, 9, 4, 19, 4]], bbox=[3, 4, 16, 1]), "contour-empty"
+    ),
     "polygon outside": Broken(
-        _set(0, segmentation=[[80, 4, 99, 4, 99, 28, 80, 28]], bbox=[80, 4, 19, 24]), "contour-empty"
+        _set(0, segmentation=[[80, 4, 99, 4, 99, 28, 80, 28]], bbox=[80, 4, 19, 24]),
+        "contour-empty",
     ),
     "polygon reaches out": Broken(
-        _set(0, segmentation=[[-9, 4, 19, 4, 19, 28, -9, 28]], bbox=[-9, 4, 28, 24], area=456), "contour-outside"
+        _set(0, segmentation=[[-9, 4, 19, 4, 19, 28, -9, 28]], bbox=[-9, 4, 28, 24], area=456),
+        "contour-outside",
     ),
-    "polygon crosses itself": Broken(_set(0, segmentation=_CROSSING, bbox=[5, 5, 20, 25]), "contour-crossing"),
+    "polygon crosses itself": Broken(
+        _set(0, segmentation=_CROSSING, bbox=[5, 5, 20, 25]), "contour-crossing"
+    ),
     "RLE empty": Broken(_set(0, segmentation=_rle([HEIGHT * WIDTH])), "contour-empty"),
-    "RLE of another size": Broken(_set(0, segmentation=_rle([WIDTH * HEIGHT], (WIDTH, HEIGHT))), "rle-size"),
+    "RLE of another size": Broken(
+        _set(0, segmentation=_rle([WIDTH * HEIGHT], (WIDTH, HEIGHT))), "rle-size"
+    ),
     "RLE too short": Broken(_set(0, segmentation=_rle([5, 5])), "rle-counts"),
     "RLE text damaged": Broken(_set(0, segmentation=_rle(_GOOD[:-3])), "rle-counts"),
     "box without width": Broken(_set(0, bbox=[3, 4, 0, 24]), "box-degenerate"),
@@ -211,7 +242,8 @@ BROKEN: dict[str, Broken] = {
     "area of another unit": Broken(_set(0, area=3.84), "area-wrong"),
     "area of text": Broken(_set(0, area="large"), "area-wrong"),
     "object of one pixel": Broken(
-        _set(0, segmentation=[[30, 5, 31, 5, 31, 6, 30, 6]], bbox=[30, 5, 1, 1], area=1), "object-tiny"
+        _set(0, segmentation=[[30, 5, 31, 5, 31, 6, 30, 6]], bbox=[30, 5, 1, 1], area=1),
+        "object-tiny",
     ),
     "crowd": Broken(_set(0, iscrowd=1), "crowd"),
     "crowd as text": Broken(_set(0, iscrowd="1"), "crowd"),

@@ -12,10 +12,19 @@ CATEGORIES = [{"id": 20, "name": "car"}, {"id": 10, "name": "person"}]
 COLOURS = {10: (250, 60, 60), 20: (60, 60, 250)}  # RGB
 
 
-def rectangle(image_id: int, category: int, box: tuple[int, int, int, int], number: int) -> dict[str, Any]:
+def rectangle(
+    image_id: int, category: int, box: tuple[int, int, int, int], number: int
+) -> dict[str, Any]:
     x, y, w, h = box
     polygon = [x, y, x + w, y, x + w, y + h, x, y + h]
-    row = {"id": number, "image_id": image_id, "category_id": category, "bbox": list(box), "area": w * h, "iscrowd": 0}
+    row = {
+        "id": number,
+        "image_id": image_id,
+        "category_id": category,
+        "bbox": list(box),
+        "area": w * h,
+        "iscrowd": 0,
+    }
     return {**row, "segmentation": [polygon]}
 
 
@@ -29,12 +38,18 @@ def draw_image(path: Path, rows: list[dict[str, Any]], seed: int) -> None:
 
 
 def content(images: Path, name: str, count: int) -> dict[str, Any]:
-    """`count` images, each with a person and a car; draws them into the folder. Those of "val" look different."""
+    """`count` images, each with a person and a car; draws them into the folder. Those of "val" look
+    different.
+    """
     rows, files = [], []
     other = name == "val"
     for i in range(1, count + 1):
-        people = rectangle(i, 10, (34 + i, 20, 16, 24) if other else (2 + i, 4, 16, 24), len(rows) + 1)
-        cars = rectangle(i, 20, (4, 4 + i % 4, 24, 14) if other else (30, 20 + i % 4, 24, 14), len(rows) + 2)
+        people = rectangle(
+            i, 10, (34 + i, 20, 16, 24) if other else (2 + i, 4, 16, 24), len(rows) + 1
+        )
+        cars = rectangle(
+            i, 20, (4, 4 + i % 4, 24, 14) if other else (30, 20 + i % 4, 24, 14), len(rows) + 2
+        )
         file_name = f"{name}_{i}.png"
         draw_image(images / file_name, [people, cars], 1000 * other + i)
         rows += [people, cars]

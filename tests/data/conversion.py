@@ -27,7 +27,9 @@ def converted(format: Any, source: Path, **options: Any) -> dict[str, CocoSplit]
 
 def image_of(splits: dict[str, CocoSplit], name: str) -> CocoImage:
     """The image of this file name, whichever split it is in."""
-    (found,) = [image for split in splits.values() for image in split.images if image.path.stem == name]
+    (found,) = [
+        image for split in splits.values() for image in split.images if image.path.stem == name
+    ]
     return found
 
 
@@ -38,7 +40,9 @@ def masks_of(splits: dict[str, CocoSplit], name: str) -> list[tuple[str, NDArray
     return [(names[o.label - 1], o.mask(image.height, image.width)) for o in image.objects]
 
 
-def drawn(*polygons: list[float], size: tuple[int, int] = (toys.HEIGHT, toys.WIDTH)) -> NDArray[np.uint8]:
+def drawn(
+    *polygons: list[float], size: tuple[int, int] = (toys.HEIGHT, toys.WIDTH)
+) -> NDArray[np.uint8]:
     """The mask of polygons."""
     return CocoObject(1, 1, (0, 0, 1, 1), 1, list(polygons), False).mask(*size)
 

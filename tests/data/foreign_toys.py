@@ -60,19 +60,33 @@ def points(flat: list[float]) -> list[list[float]]:
 
 def shape(label: str, kind: str, flat: list[float], **more: Any) -> dict[str, Any]:
     """One of labelme's shapes."""
-    return {"label": label, "points": points(flat), "group_id": None, "shape_type": kind, "flags": {}} | more
+    return {
+        "label": label,
+        "points": points(flat),
+        "group_id": None,
+        "shape_type": kind,
+        "flags": {},
+    } | more
 
 
 def labelme_file(path: Path, shapes: list[Any], image: str | None = None, **more: Any) -> Path:
-    content = {"version": "5.5.0", "flags": {}, "shapes": shapes, "imagePath": image or f"{path.stem}.png"}
-    return write(path, content | {"imageData": None, "imageHeight": HEIGHT, "imageWidth": WIDTH} | more)
+    content = {
+        "version": "5.5.0",
+        "flags": {},
+        "shapes": shapes,
+        "imagePath": image or f"{path.stem}.png",
+    }
+    return write(
+        path, content | {"imageData": None, "imageHeight": HEIGHT, "imageWidth": WIDTH} | more
+    )
 
 
 def labelme(root: Path) -> Path:
     for seed, name in enumerate(NAMES):
         picture(root / f"{name}.png", seed)
         labelme_file(
-            root / f"{name}.json", [shape("person", "polygon", PERSON), shape("car", "rectangle", [30, 20, 54, 34])]
+            root / f"{name}.json",
+            [shape("person", "polygon", PERSON), shape("car", "rectangle", [30, 20, 54, 34])],
         )
     return root
 
@@ -96,7 +110,12 @@ def via(root: Path, regions: list[dict[str, Any]] | None = None) -> Path:
     for seed, name in enumerate(NAMES):
         picture(root / f"{name}.png", seed)
         own = regions if regions is not None and name == "a" else person_and_car()
-        content[f"{name}.png99"] = {"filename": f"{name}.png", "size": 99, "regions": own, "file_attributes": {}}
+        content[f"{name}.png99"] = {
+            "filename": f"{name}.png",
+            "size": 99,
+            "regions": own,
+            "file_attributes": {},
+        }
     write(root / "via.json", content)
     return root
 
@@ -106,7 +125,9 @@ def yolo_row(index: int, polygon: list[float]) -> str:
     return " ".join([str(index), *(f"{value:.6f}" for value in values)])
 
 
-def yolo(root: Path, yaml: str = "path: .\ntrain: images/train\nval: images/val\nnames: [person, car]\n") -> Path:
+def yolo(
+    root: Path, yaml: str = "path: .\ntrain: images/train\nval: images/val\nnames: [person, car]\n"
+) -> Path:
     write(root / "data.yaml", yaml)
     for seed, name in enumerate(NAMES):
         split = "val" if name == "d" else "train"
@@ -132,7 +153,9 @@ def voc_colour(index: int) -> tuple[int, int, int]:
 
 
 def voc_labels(void: bool = True) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Pixels of objects (1 person, 2 car) and of VOC's classes (15, 7), with a void line around the car."""
+    """Pixels of objects (1 person, 2 car) and of VOC's classes (15, 7), with a void line around the
+    car.
+    """
     x0, y0, x1, y1 = CAR
     objects = box_mask(5, 4, 25, 30) + 2 * box_mask(*CAR)
     classes = 15 * box_mask(5, 4, 25, 30) + 7 * box_mask(*CAR)

@@ -15,7 +15,14 @@ from pycocotools import mask as rle
 
 from cohdc_train.cli import main
 from cohdc_train.data.annotations import read_image
-from cohdc_train.data.coco import CocoPaths, CocoSplit, SplitPaths, find_split, read_folder, read_split
+from cohdc_train.data.coco import (
+    CocoPaths,
+    CocoSplit,
+    SplitPaths,
+    find_split,
+    read_folder,
+    read_split,
+)
 from cohdc_train.errors import DataError
 
 PERSON, CAR = 1, 2  # labels: categories are sorted by id, 10 and 20
@@ -53,7 +60,10 @@ def test_every_layout_is_found(tmp_path: Path, layout: str, validation: str) -> 
     folder = read_folder([tmp_path])
     assert folder.class_names == ("person", "car")
     assert [len(split.images) for split in (*folder.train, folder.val)] == [2, 2]
-    assert {labels_of for split in (*folder.train, folder.val) for labels_of in labels(split)} == {PERSON, CAR}
+    assert {labels_of for split in (*folder.train, folder.val) for labels_of in labels(split)} == {
+        PERSON,
+        CAR,
+    }
 
 
 def test_explicit_paths_stand_alone_and_override(tmp_path: Path) -> None:
@@ -78,12 +88,19 @@ def test_polygons_and_both_rle_give_the_same_mask(tmp_path: Path) -> None:
     def change(segmentation: Any) -> Any:
         return lambda v: v["annotations"][0].update(segmentation=segmentation, bbox=[5, 4, 35, 36])
 
-    expected = split_of(tmp_path, change(polygon)).images[0].objects[0].mask(toys.HEIGHT, toys.WIDTH)
+    expected = (
+        split_of(tmp_path, change(polygon)).images[0].objects[0].mask(toys.HEIGHT, toys.WIDTH)
+    )
     runs = np.flatnonzero(np.diff(np.concatenate([[0], expected.ravel(order="F"), [0]])))
     counts = np.diff(np.concatenate([[0], runs, [flat.size]])).tolist()
     assert expected.sum() == 20 * 26 + cv2.countNonZero(expected[30:, 28:])
     for segmentation in (compressed, {"size": [toys.HEIGHT, toys.WIDTH], "counts": counts}):
-        got = split_of(tmp_path, change(segmentation)).images[0].objects[0].mask(toys.HEIGHT, toys.WIDTH)
+        got = (
+            split_of(tmp_path, change(segmentation))
+            .images[0]
+            .objects[0]
+            .mask(toys.HEIGHT, toys.WIDTH)
+        )
         assert np.array_equal(got, expected)
 
 
@@ -99,7 +116,9 @@ def test_the_class_filter_remaps_and_counts_classes(tmp_path: Path) -> None:
         split_of(tmp_path, classes=["dog"])
 
 
-@pytest.mark.parametrize(("given", "crowd"), [(1, True), ("1", True), (True, True), ("0", False), (None, False)])
+@pytest.mark.parametrize(
+    ("given", "crowd"), [(1, True), ("1", True), (True, True), ("0", False), (None, False)]
+)
 def test_crowd_and_images_without_objects_are_kept(given: Any, crowd: bool, tmp_path: Path) -> None:
     def change(value: dict[str, Any]) -> None:
         value["annotations"] = [row for row in value["annotations"] if row["image_id"] == 1]
@@ -147,8 +166,12 @@ def test_a_missing_box_comes_from_the_contour(tmp_path: Path) -> None:
 MISTAKES = {
     "image_id 99 is not in the file": lambda v: v["annotations"][0].update(image_id=99),
     "annotation 2: category_id 7": lambda v: v["annotations"][1].update(category_id=7),
-    "neither polygons nor RLE": lambda v: v["annotations"][0].update(segmentation={"size": [48, 64]}),
-    "RLE of size": lambda v: v["annotations"][0].update(segmentation={"size": [64, 48], "counts": [64 * 48]}),
+    "neither polygons nor RLE": lambda v: v["annotations"][0].update(
+        segmentation={"size": [48, 64]}
+    ),
+    "RLE of size": lambda v: v["annotations"][0].update(
+        segmentation={"size": [64, 48], "counts": [64 * 48]}
+    ),
     "image 2: .*gone.png does not exist": lambda v: v["images"][1].update(file_name="gone.png"),
     "needs id, file_name, height and width": lambda v: v["images"][0].pop("height"),
     "1 image ids are used twice": lambda v: v["images"][1].update(id=1),
@@ -168,7 +191,9 @@ def test_mistakes_are_named_in_one_line(tmp_path: Path, message: str) -> None:
 def test_a_missing_folder_file_or_bracket_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere: no such folder$"):
         find_split(tmp_path / "nowhere", "train")
-    with pytest.raises(DataError, match=r"no annotations of split 'train'; looked for instances_train\.json"):
+    with pytest.raises(
+        DataError, match=r"no annotations of split 'train'; looked for instances_train\.json"
+    ):
         find_split(tmp_path, "train")
     broken = tmp_path / "broken.json"
     broken.write_text('{"images": [],\n "annotations": [', encoding="utf-8")
@@ -190,7 +215,9 @@ def test_train_and_val_agree_by_name_whatever_their_ids(tmp_path: Path) -> None:
     assert labels(read_folder([root]).val) == [PERSON, CAR] * 2
     value["categories"][0]["name"] = "truck"
     toys.write(path, value)
-    with pytest.raises(DataError, match=r"instances_val\.json: classes are truck, person; the training split's are"):
+    with pytest.raises(
+        DataError, match=r"instances_val\.json: classes are truck, person; the training split's are"
+    ):
         read_folder([root])
     assert read_folder([root], ["person"]).class_names == ("person",)
 
@@ -224,7 +251,14 @@ def test_stats_prints_the_counts(tmp_path: Path, capsys: pytest.CaptureFixture[s
     root = toys.folder(tmp_path)
     assert main(["data", "stats", str(root)]) == 0
     rows = {tuple(line.split(maxsplit=1)) for line in capsys.readouterr().out.splitlines()}
-    wanted = {"images": 6, "objects": 12, "images without objects": 0, "crowd": 0, "dropped": 0, "class person": 6}
+    wanted = {
+        "images": 6,
+        "objects": 12,
+        "images without objects": 0,
+        "crowd": 0,
+        "dropped": 0,
+        "class person": 6,
+    }
     for name, value in wanted.items():
         assert ("train", f"{name:<24}{value}") in rows
     assert main(["data", "stats", str(tmp_path / "images")]) == 1

@@ -1,4 +1,6 @@
-"""Every foreign format becomes a folder that training reads: the same masks, nothing lost unsaid, or nothing at all."""
+"""Every foreign format becomes a folder that training reads: the same masks, nothing lost unsaid,
+or nothing at all.
+"""
 
 import json
 import os
@@ -36,8 +38,15 @@ def test_masks_come_back_and_the_doctor_has_no_complaint(
         assert np.array_equal(objects["car"], toys.box_mask(*toys.CAR))
         box = {splits["train"].class_names[o.label - 1]: o.box for o in image.objects}
         assert box["car"] == (30, 20, 24, 14)
-        assert image.objects[0].area == objects[splits["train"].class_names[image.objects[0].label - 1]].sum()
-        original = next(p for p in (tmp_path / "source").rglob(f"{name}.?*g") if not p.parent.name.startswith("Seg"))
+        assert (
+            image.objects[0].area
+            == objects[splits["train"].class_names[image.objects[0].label - 1]].sum()
+        )
+        original = next(
+            p
+            for p in (tmp_path / "source").rglob(f"{name}.?*g")
+            if not p.parent.name.startswith("Seg")
+        )
         assert image.path.samefile(original)
         assert read_image(image).shape == (toys.HEIGHT, toys.WIDTH, 3)
     assert sorted(path.name for path in (tmp_path / "source_coco").iterdir()) == [
@@ -52,13 +61,18 @@ def test_masks_come_back_and_the_doctor_has_no_complaint(
     assert found == ({"category-unused"} if format == "voc" else set())
 
 
-def test_the_command_line_tells_counts_and_what_comes_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_tells_counts_and_what_comes_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = toys.labelme(tmp_path / "source")
     line = toys.shape("person", "linestrip", [1, 1, 9, 9, 20, 4])
     toys.labelme_file(root / "a.json", [toys.shape("person", "polygon", toys.PERSON), line])
     toys.picture(root / "new.jpg", 9)
     out = tmp_path / "out"
-    assert main(["data", "convert", "labelme", str(root), str(out), "--val", "0.5", "--seed", "3"]) == 0
+    assert (
+        main(["data", "convert", "labelme", str(root), str(out), "--val", "0.5", "--seed", "3"])
+        == 0
+    )
     assert capsys.readouterr().out.splitlines() == [
         "split: drawn, --val 0.5 --seed 3",
         "train: images 2; objects 3; class car 1; class person 2",
@@ -108,14 +122,18 @@ def test_same_names_in_different_folders_keep_them(tmp_path: Path) -> None:
     toys.labelme_file(root / ".hidden" / "a.json", "no shapes")  # type: ignore[arg-type]
     splits = converted("labelme", root)
     names = {name for split in splits.values() for name in file_names(split)}
-    assert names == {f"{folder}/{stem}.png" for folder in ("one", "two/deep") for stem in toys.NAMES}
+    assert names == {
+        f"{folder}/{stem}.png" for folder in ("one", "two/deep") for stem in toys.NAMES
+    }
     for split in splits.values():
         for name, image in zip(file_names(split), split.images, strict=True):
             assert image.path.samefile(root / name)
 
 
 def test_sub_paths_that_the_layout_would_misread_are_refused(tmp_path: Path) -> None:
-    root = toys.yolo(tmp_path / "source", "train: images\nval: images/train/train\nnames: [person, car]\n")
+    root = toys.yolo(
+        tmp_path / "source", "train: images\nval: images/train/train\nnames: [person, car]\n"
+    )
     for split in ("train/train", "train"):
         toys.picture(root / "images" / split / "a.png", 1)
         toys.write(root / "labels" / split / "a.txt", toys.yolo_row(0, toys.PERSON))
@@ -129,7 +147,9 @@ def test_sub_paths_that_the_layout_would_misread_are_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_nothing_is_left_when_writing_fails(tmp_path: Path, format: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_left_when_writing_fails(
+    tmp_path: Path, format: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = BUILD[format](tmp_path / "source")
     before = sorted(source.rglob("*"))
 
@@ -147,7 +167,9 @@ def test_a_full_folder_is_refused_and_an_empty_one_taken(tmp_path: Path) -> None
     source = toys.yolo(tmp_path / "source")
     out = tmp_path / "out"
     toys.write(out / "mine.txt", "keep")
-    with pytest.raises(DataError, match=r"out: holds 1 entries already; give a new or an empty folder$"):
+    with pytest.raises(
+        DataError, match=r"out: holds 1 entries already; give a new or an empty folder$"
+    ):
         convert("yolo", source, out)
     assert [path.name for path in out.iterdir()] == ["mine.txt"]
     (out / "mine.txt").unlink()
@@ -155,7 +177,9 @@ def test_a_full_folder_is_refused_and_an_empty_one_taken(tmp_path: Path) -> None
     assert (out / "instances_val.json").is_file()
 
 
-def test_images_are_copied_where_links_are_impossible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_copied_where_links_are_impossible(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def other_disk(*_: object) -> None:
         raise OSError("Invalid cross-device link")
 
@@ -176,12 +200,20 @@ def test_images_are_copied_where_links_are_impossible(tmp_path: Path, monkeypatc
 # Pascal VOC
 
 
-JUNK = st.sampled_from([None, -1, 1e9, 10**400, float("nan"), "", "x" * 300, True, [], [[1, 2]], {}, {"a": 1}])
+JUNK = st.sampled_from(
+    [None, -1, 1e9, 10**400, float("nan"), "", "x" * 300, True, [], [[1, 2]], {}, {"a": 1}]
+)
 
 
 def places(value: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The ways to every value inside of a JSON value."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     return [found for key, part in pairs for found in [(*way, key), *places(part, (*way, key))]]
 
 
@@ -211,7 +243,9 @@ def test_json_damaged_anywhere_is_converted_or_named(format: Any, data: st.DataO
 def test_errors_of_any_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = toys.labelme(tmp_path / "source")
     refused(tmp_path, "labelme", tmp_path / "gone", r"gone: no such file or folder$")
-    refused(tmp_path, "labelme", tmp_path, r"--attribute is for via, not for labelme$", attribute="x")
+    refused(
+        tmp_path, "labelme", tmp_path, r"--attribute is for via, not for labelme$", attribute="x"
+    )
     refused(tmp_path, "yolo", tmp_path, r"--names is for voc and via, not for yolo$", names=root)
     refused(tmp_path, "labelme", root / "a.json", r"a\.json: 1 image; two or more are needed")
     refused(tmp_path, "labelme", root, r"--val 1\.0: must be between 0 and 1$", val=1.0)

@@ -27,7 +27,10 @@ def module(root: Path, **more: Any) -> CocoDataModule:
 def test_classes_come_from_the_file(tmp_path: Path) -> None:
     data = module(toys.folder(tmp_path))
     assert (data.class_names, data.num_classes) == (["person", "car"], 2)
-    assert data.val_ground_truth["categories"] == [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}]
+    assert data.val_ground_truth["categories"] == [
+        {"id": 1, "name": "person"},
+        {"id": 2, "name": "car"},
+    ]
 
 
 def test_a_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
@@ -46,12 +49,22 @@ def test_a_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
             assert target["masks"].dtype == torch.uint8
             assert target["ignore"].shape == (0, 4)
             assert set(target["labels"].tolist()) <= {1, 2}
-    assert sorted(target["image_id"] for batch in batches for target in batch.targets) == [1, 2, 3, 4, 5, 6]
+    assert sorted(target["image_id"] for batch in batches for target in batch.targets) == [
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+    ]
 
 
 @pytest.mark.parametrize("photometric", [True, False])
 def test_after_the_transfer_images_are_unit_floats(tmp_path: Path, photometric: bool) -> None:
-    data = module(toys.folder(tmp_path), augment=Augmentation(photometric=photometric, scale_jitter=(0.5, 0.6)))
+    data = module(
+        toys.folder(tmp_path),
+        augment=Augmentation(photometric=photometric, scale_jitter=(0.5, 0.6)),
+    )
     torch.manual_seed(0)
     before = next(iter(data.train_dataloader()))
     after = data.on_after_batch_transfer(before, 0)
@@ -70,7 +83,9 @@ def test_after_the_transfer_images_are_unit_floats(tmp_path: Path, photometric: 
 def test_objects_cropped_away_are_dropped_with_their_labels(tmp_path: Path) -> None:
     data = module(toys.folder(tmp_path), augment=Augmentation(scale_jitter=(3.0, 3.0)))
     torch.manual_seed(0)
-    targets = [target for _ in range(4) for batch in data.train_dataloader() for target in batch.targets]
+    targets = [
+        target for _ in range(4) for batch in data.train_dataloader() for target in batch.targets
+    ]
     assert {len(target["labels"]) for target in targets} >= {0, 1}
     for target in targets:
         assert (target["boxes"][:, 2:] > target["boxes"][:, :2]).all()
@@ -101,7 +116,9 @@ def test_validation_images_are_untouched(tmp_path: Path) -> None:
     assert data.on_after_batch_transfer(batch, 0) is batch
 
 
-@pytest.mark.filterwarnings("ignore:This DataLoader will create 2 worker processes")  # torch's advice on one core
+@pytest.mark.filterwarnings(
+    "ignore:This DataLoader will create 2 worker processes"
+)  # torch's advice on one core
 @pytest.mark.parametrize("workers", [0, 2])
 def test_the_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
     root = toys.folder(tmp_path)
@@ -148,10 +165,17 @@ def test_hundreds_of_objects_on_a_large_image_take_little_memory(tmp_path: Path)
     """All masks at the image's size would be 9.6 GB."""
     root, height, width = toys.folder(tmp_path), 4000, 6000
     cv2.imwrite(str(root / "images" / "large.jpg"), np.full((height, width, 3), 120, np.uint8))
-    rows = [toys.rectangle(1, 10, (i % 20 * 290, i // 20 * 190, 250, 160), i + 1) for i in range(400)]
+    rows = [
+        toys.rectangle(1, 10, (i % 20 * 290, i // 20 * 190, 250, 160), i + 1) for i in range(400)
+    ]
     image = {"id": 1, "file_name": "large.jpg", "height": height, "width": width}
-    toys.write(root / "instances_train.json", {"images": [image], "annotations": rows, "categories": toys.CATEGORIES})
-    done = subprocess.run([sys.executable, "-c", _PEAK, str(root)], capture_output=True, text=True, check=True)
+    toys.write(
+        root / "instances_train.json",
+        {"images": [image], "annotations": rows, "categories": toys.CATEGORIES},
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", _PEAK, str(root)], capture_output=True, text=True, check=True
+    )
     objects, mebibytes = (int(word) for word in done.stdout.split())
     assert objects > 100
     assert mebibytes < 1000

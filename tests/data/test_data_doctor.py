@@ -1,4 +1,6 @@
-"""The doctor on folders that are broken on purpose: it names each, training agrees with it, and the mend holds."""
+"""The doctor on folders that are broken on purpose: it names each, training agrees with it, and the
+mend holds.
+"""
 
 import json
 import re
@@ -26,7 +28,13 @@ from cohdc_train.errors import DataError
 from cohdc_train.models import MaskRCNN, NetworkConfig
 
 TINY = NetworkConfig(
-    depth=18, width=0.125, fpn_channels=8, fc=16, canvas=(32, 48), anchor_scales=(8, 16, 32, 64), rois=16
+    depth=18,
+    width=0.125,
+    fpn_channels=8,
+    fc=16,
+    canvas=(32, 48),
+    anchor_scales=(8, 16, 32, 64),
+    rois=16,
 )
 
 # Errors about what is learned and scored, not about what can be read.
@@ -42,7 +50,8 @@ def findings(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[s
 # What training does with a warning of this kind is counted in the line that it logs.
 COUNTED = {
     **dict.fromkeys(
-        ("contour-missing", "contour-number", "contour-short", "contour-odd", "contour-empty"), "dropped|left"
+        ("contour-missing", "contour-number", "contour-short", "contour-odd", "contour-empty"),
+        "dropped|left",
     ),
     **dict.fromkeys(("box-degenerate", "box-inverted"), "degenerate box"),
     "box-outside": "clipped",
@@ -67,7 +76,9 @@ def train_once(paths: dict[str, Any]) -> int:
     return sum(len(target["labels"]) for batch in batches for target in batch.targets)
 
 
-def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, found = findings(broken_folders.whole(tmp_path / "a"))
     assert code == 0
     assert found == {"train": {"category-gap": ["10, 20"]}, "val": {"category-gap": ["10, 20"]}}
@@ -80,7 +91,12 @@ def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(tmp_path: Path, capsy
 def test_the_corpus_is_large_and_shows_most_kinds() -> None:
     shown = {case.kind for case in broken_folders.BROKEN.values()}
     assert len(broken_folders.BROKEN) >= 50
-    assert set(KINDS) - shown == {"category-gap", "category-unused", "class-only-val", "image-empty"}
+    assert set(KINDS) - shown == {
+        "category-gap",
+        "category-unused",
+        "class-only-val",
+        "image-empty",
+    }
 
 
 @pytest.mark.parametrize("name", broken_folders.BROKEN)
@@ -113,7 +129,9 @@ def test_it_is_found_training_agrees_and_the_mend_holds(
 
 
 def check_mended(folder: Path, root: Path) -> None:
-    """The mended files train without a loss, hold no error, and with the removed rows all that there was."""
+    """The mended files train without a loss, hold no error, and with the removed rows all that
+    there was.
+    """
     images = root / "images"
     files = {name: folder / f"instances_{name}.json" for name in ("train", "val")}
     paths = CocoPaths(files["train"], images, files["val"], images)
@@ -124,7 +142,11 @@ def check_mended(folder: Path, root: Path) -> None:
     for name, file in files.items():
         given, kept = json.loads((root / file.name).read_text()), json.loads(file.read_text())
         for key in ("images", "annotations", "categories"):
-            gone = [row for row in removed[name] if row["row"] not in kept[key] and row["row"] in given[key]]
+            gone = [
+                row
+                for row in removed[name]
+                if row["row"] not in kept[key] and row["row"] in given[key]
+            ]
             assert len(kept[key]) + len(gone) == len(given[key]), (key, gone)
     linked = root.parent / "linked"
     linked.mkdir()
@@ -133,11 +155,15 @@ def check_mended(folder: Path, root: Path) -> None:
         (linked / file.name).write_bytes(file.read_bytes())
     code, found = findings(linked)
     assert code == 0
-    still = {kind for split in found.values() for kind in split if KINDS[kind].severity == "warning"}
+    still = {
+        kind for split in found.values() for kind in split if KINDS[kind].severity == "warning"
+    }
     assert still <= {"image-colour", "category-unused", "class-only-val"}
 
 
-def test_the_mend_never_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_mend_never_overwrites_what_it_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = broken_folders.build(tmp_path / "a", "box elsewhere")
     before = (root / "instances_train.json").read_bytes()
     assert main(["data", "doctor", str(root), "--fix", str(root)]) == 1
@@ -193,7 +219,9 @@ def test_anchor_overlap_is_torchvisions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     canvas, scales = (128, 192), (16, 32, 64, 128, 100)
     corner = rng.uniform((0, 0), (150, 90), (12, 2))
-    boxes = np.concatenate([corner, corner + rng.uniform(4, 60, (12, 2))], axis=1).clip(0, (192, 128, 192, 128))
+    boxes = np.concatenate([corner, corner + rng.uniform(4, 60, (12, 2))], axis=1).clip(
+        0, (192, 128, 192, 128)
+    )
     maps = [torch.zeros(1, 1, -(-canvas[0] // s), -(-canvas[1] // s)) for s in (4, 8, 16, 32, 64)]
     generator = AnchorGenerator(tuple((s,) for s in scales), ((0.5, 1.0, 2.0),) * 5)
     (anchors,) = generator(ImageList(torch.zeros(1, 3, *canvas), [canvas]), maps)

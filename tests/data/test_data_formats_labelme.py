@@ -1,4 +1,6 @@
-"""labelme: every shape with an inside, images inside the JSON or turned by EXIF, and every mistake named."""
+"""labelme: every shape with an inside, images inside the JSON or turned by EXIF, and every mistake
+named.
+"""
 
 import base64
 from pathlib import Path
@@ -14,7 +16,9 @@ from cohdc_train.cli import main
 from cohdc_train.data.annotations import read_image
 
 
-def test_labelme_every_shape_with_an_inside(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_labelme_every_shape_with_an_inside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = toys.labelme(tmp_path / "source")
     spot = np.pad(np.ones((5, 7), np.uint8), ((1, 0), (0, 2)))
     groups = [[2.0, 2.0, 12.0, 2.0, 12.0, 9.0, 2.0, 9.0], [40.0, 30.0, 50.0, 30.0, 45.0, 40.0]]
@@ -37,7 +41,16 @@ def test_labelme_every_shape_with_an_inside(tmp_path: Path, capsys: pytest.Captu
     splits = converted("labelme", root)
     assert splits["train"].class_names == ("bike", "car", "person", "wheel")
     found = masks_of(splits, "a")
-    assert [name for name, _ in found] == ["person", "person", "person", "bike", "person", "wheel", "person", "person"]
+    assert [name for name, _ in found] == [
+        "person",
+        "person",
+        "person",
+        "bike",
+        "person",
+        "wheel",
+        "person",
+        "person",
+    ]
     masks = [mask for _, mask in found]
     assert np.array_equal(masks[0], toys.box_mask(*toys.CAR))
     assert iou(masks[1], toys.disk_mask(32, 24, 12, 12)) > 0.98
@@ -63,15 +76,26 @@ def test_labelme_image_inside_the_json_or_elsewhere(tmp_path: Path) -> None:
     png = (root / "a.png").read_bytes()
     data = toys.base64_png(np.asarray(Image.open(root / "a.png")))
     (root / "a.png").unlink()
-    toys.labelme_file(root / "a.json", [toys.shape("person", "polygon", toys.PERSON)], "gone.bmp", imageData=data)
+    toys.labelme_file(
+        root / "a.json", [toys.shape("person", "polygon", toys.PERSON)], "gone.bmp", imageData=data
+    )
     (root / "b.png").rename(tmp_path / "source" / "b.png")
-    toys.labelme_file(root / "b.json", [toys.shape("person", "polygon", toys.PERSON)], "..\\b.png", imageHeight=None)
-    toys.labelme_file(root / "c.json", [toys.shape("person", "polygon", toys.PERSON)], "C:\\somebody\\c.png")
+    toys.labelme_file(
+        root / "b.json",
+        [toys.shape("person", "polygon", toys.PERSON)],
+        "..\\b.png",
+        imageHeight=None,
+    )
+    toys.labelme_file(
+        root / "c.json", [toys.shape("person", "polygon", toys.PERSON)], "C:\\somebody\\c.png"
+    )
     splits = converted("labelme", tmp_path / "source")
     assert image_of(splits, "a").path.read_bytes() == png
     assert image_of(splits, "b").path.samefile(tmp_path / "source" / "b.png")
     assert image_of(splits, "c").path.samefile(root / "c.png")
-    assert all(np.array_equal(masks_of(splits, name)[0][1], drawn(toys.PERSON)) for name in toys.NAMES)
+    assert all(
+        np.array_equal(masks_of(splits, name)[0][1], drawn(toys.PERSON)) for name in toys.NAMES
+    )
 
 
 def test_pictures_that_exif_turns_are_written_as_they_were_annotated(
@@ -84,7 +108,9 @@ def test_pictures_that_exif_turns_are_written_as_they_were_annotated(
     toys.labelme_file(root / "turned.json", shapes, "turned.jpg")
     toys.picture(root / "plain.jpg", 21, exif=8)
     toys.labelme_file(root / "plain.json", shapes, "plain.jpg")
-    data = (toys.picture(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)).read_bytes()
+    data = (
+        toys.picture(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
+    ).read_bytes()
     toys.labelme_file(root / "inside.json", shapes, "no.jpg", imageData=embedded(data))
     splits = converted("labelme", root)
     shown = {}
@@ -93,7 +119,9 @@ def test_pictures_that_exif_turns_are_written_as_they_were_annotated(
         upright = cv2.cvtColor(cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE), cv2.COLOR_BGR2RGB)
         shown[name] = read_image(image_of(splits, name)).astype(int)
         assert np.abs(shown[name] - upright).mean() < 6  # JPEG once more
-    assert image_of(splits, "plain").path.samefile(root / "plain.jpg")  # annotated on the unturned pixels
+    assert image_of(splits, "plain").path.samefile(
+        root / "plain.jpg"
+    )  # annotated on the unturned pixels
     assert "       2  image turned as its EXIF says, and written anew: " in capsys.readouterr().out
     assert main(["data", "doctor", str(tmp_path / "source_coco")]) == 0
 
@@ -105,22 +133,31 @@ def embedded(data: bytes) -> str:
 LABELME_ERRORS = {
     r"a\.json: line 1: not JSON": lambda p: toys.write(p, "{"),
     r"a\.json: not labelme's: no list 'shapes'$": lambda p: toys.write(p, {"images": []}),
-    r"a\.json: shape 1: no label$": lambda p: toys.labelme_file(p, [toys.shape("", "polygon", toys.PERSON)]),
-    r"a\.json: shape 1: circle needs its centre": lambda p: toys.labelme_file(p, [toys.shape("x", "circle", [1, 2])]),
-    r"a\.json: shape 2: rectangle needs two": lambda p: toys.labelme_file(
-        p, [toys.shape("x", "polygon", toys.PERSON), toys.shape("x", "rectangle", [1, 2, 3, 4, 5, 6])]
+    r"a\.json: shape 1: no label$": lambda p: toys.labelme_file(
+        p, [toys.shape("", "polygon", toys.PERSON)]
     ),
-    r"a\.json: shape 1: polygon needs points": lambda p: toys.labelme_file(p, [{"label": "x", "points": [[1, "y"]]}]),
+    r"a\.json: shape 1: circle needs its centre": lambda p: toys.labelme_file(
+        p, [toys.shape("x", "circle", [1, 2])]
+    ),
+    r"a\.json: shape 2: rectangle needs two": lambda p: toys.labelme_file(
+        p,
+        [toys.shape("x", "polygon", toys.PERSON), toys.shape("x", "rectangle", [1, 2, 3, 4, 5, 6])],
+    ),
+    r"a\.json: shape 1: polygon needs points": lambda p: toys.labelme_file(
+        p, [{"label": "x", "points": [[1, "y"]]}]
+    ),
     r"a\.json: shape 1: mask needs points .* and a base64 PNG": lambda p: toys.labelme_file(
         p, [toys.shape("x", "mask", [1, 2, 9, 9], mask="aGk=")]
     ),
     r"a\.json: shape 1: mask .* that fills them$": lambda p: toys.labelme_file(
         p, [toys.shape("x", "mask", [1, 2, 9, 9], mask=toys.base64_png(np.ones((4, 4), np.uint8)))]
     ),
-    r"a\.json: imagePath 'no\.png' does not exist, and there is no imageData$": lambda p: toys.labelme_file(
-        p, [], "no.png"
+    r"a\.json: imagePath 'no\.png' does not exist, and there is no imageData$": lambda p: (
+        toys.labelme_file(p, [], "no.png")
     ),
-    r"a\.json: imageData cannot be read as an image$": lambda p: toys.labelme_file(p, [], "no.png", imageData="aGk="),
+    r"a\.json: imageData cannot be read as an image$": lambda p: toys.labelme_file(
+        p, [], "no.png", imageData="aGk="
+    ),
     r"a\.json: imageData is 4x4, the annotation 64x48$": lambda p: toys.labelme_file(
         p, [], "no.png", imageData=toys.base64_png(np.ones((4, 4), np.uint8))
     ),

@@ -43,7 +43,11 @@ def test_via_every_version_and_every_shape_with_an_inside(
             (root / "photos").mkdir(exist_ok=True)
             (root / f"{name}.png").rename(root / "photos" / f"{name}.png")
         settings = {"core": {"default_filepath": "photos/"}}
-        content = {"_via_settings": settings, "_via_img_metadata": content, "_via_attributes": {"region": {}}}
+        content = {
+            "_via_settings": settings,
+            "_via_img_metadata": content,
+            "_via_attributes": {"region": {}},
+        }
     toys.write(root / "via.json", content)
     toys.picture(root / "new.png", 30)
     splits = converted("via", root)
@@ -65,9 +69,13 @@ def test_via_every_version_and_every_shape_with_an_inside(
 
 
 def test_via_the_class_is_in_the_attribute_one_names(tmp_path: Path) -> None:
-    root = toys.via(tmp_path / "source", [toys.region("circle", {"kind": "person", "age": "7"}, cx=32, cy=24, r=12)])
+    root = toys.via(
+        tmp_path / "source",
+        [toys.region("circle", {"kind": "person", "age": "7"}, cx=32, cy=24, r=12)],
+    )
     with pytest.raises(
-        DataError, match=r"source: several region attributes, name the class's with --attribute: age, kind$"
+        DataError,
+        match=r"source: several region attributes, name the class's with --attribute: age, kind$",
     ):
         convert("via", root, tmp_path / "out")
     with pytest.raises(DataError, match=r"source: no region attribute 'name'; there is age, kind$"):
@@ -85,7 +93,8 @@ def test_via_without_attributes_takes_the_one_class_of_a_file(tmp_path: Path) ->
         content[f"{seed}"] = {"filename": f"{seed}.png", "regions": regions}
     path = toys.write(root / "via_region_data.json", content)
     with pytest.raises(
-        DataError, match=r"no region attribute to take the class from; name it in a file, --names FILE$"
+        DataError,
+        match=r"no region attribute to take the class from; name it in a file, --names FILE$",
     ):
         convert("via", path, tmp_path / "out")
     names = toys.write(tmp_path / "names.txt", "balloon\n")
@@ -93,29 +102,43 @@ def test_via_without_attributes_takes_the_one_class_of_a_file(tmp_path: Path) ->
     assert read_split("train", find_split(tmp_path / "out", "train")).class_names == ("balloon",)
     toys.write(names, "balloon\nkite\n")
     with pytest.raises(
-        DataError, match=r"names\.txt: 2 classes; --names gives all regions one, --attribute each its own$"
+        DataError,
+        match=r"names\.txt: 2 classes; --names gives all regions one, --attribute each its own$",
     ):
         convert("via", path, tmp_path / "out2", names=names)
 
 
 VIA_ERRORS = {
     r"via\.json: not VIA's: no images$": {},
-    r"via\.json: not VIA's: 'images' has no filename and regions$": {"images": [], "annotations": []},
+    r"via\.json: not VIA's: 'images' has no filename and regions$": {
+        "images": [],
+        "annotations": [],
+    },
     r"via\.json: image 'https://x\.org/a\.png' is not beside it$": {
         "a": {"filename": "https://x.org/a.png", "regions": toys.person_and_car()}
     },
-    r"via\.json: a\.png: region 1: no shape_attributes$": {"a": {"filename": "a.png", "regions": [{}]}},
+    r"via\.json: a\.png: region 1: no shape_attributes$": {
+        "a": {"filename": "a.png", "regions": [{}]}
+    },
     r"via\.json: a\.png: region 2: circle needs cx, cy, r$": {
-        "a": {"filename": "a.png", "regions": [toys.person_and_car()[0], toys.region("circle", {"kind": "x"}, cx=3)]}
+        "a": {
+            "filename": "a.png",
+            "regions": [toys.person_and_car()[0], toys.region("circle", {"kind": "x"}, cx=3)],
+        }
     },
     r"via\.json: a\.png: region 1: polygon needs all_points_x, all_points_y$": {
         "a": {
             "filename": "a.png",
-            "regions": [toys.region("polygon", {"kind": "x"}, all_points_x=[1, 2, 3], all_points_y=[1, 2])],
+            "regions": [
+                toys.region("polygon", {"kind": "x"}, all_points_x=[1, 2, 3], all_points_y=[1, 2])
+            ],
         }
     },
     r"via\.json: a\.png: region 1: ellipse needs cx, cy, rx, ry$": {
-        "a": {"filename": "a.png", "regions": [toys.region("ellipse", {"kind": "x"}, cx=3, cy=3, rx=4, ry=0)]}
+        "a": {
+            "filename": "a.png",
+            "regions": [toys.region("ellipse", {"kind": "x"}, cx=3, cy=3, rx=4, ry=0)],
+        }
     },
 }
 

@@ -30,7 +30,10 @@ def test_voc_the_majority_names_an_object_and_void_is_nothing(
     assert np.array_equal(found[1][1], toys.box_mask(*toys.CAR))
     assert all(isinstance(o.segmentation["counts"], str) for o in image_of(splits, "a").objects)
     where = root / "SegmentationObject" / "a.png"
-    assert f"       2  object without a pixel of a class under it: {where}: object 3 ..." in capsys.readouterr().out
+    assert (
+        f"       2  object without a pixel of a class under it: {where}: object 3 ..."
+        in capsys.readouterr().out
+    )
 
 
 LABELMAP = "# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:10,20,30::\nperson:200,10,0:head,foot:run\n"
@@ -41,7 +44,14 @@ def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
     """As CVAT writes it: no split, PNGs of colours, images of any type in sub folders."""
     root = tmp_path / "source"
     objects, classes = toys.voc_labels()
-    paints = {0: (0, 0, 0), 7: (10, 20, 30), 15: (200, 10, 0), 255: (224, 224, 192), 1: (128, 0, 0), 2: (0, 128, 0)}
+    paints = {
+        0: (0, 0, 0),
+        7: (10, 20, 30),
+        15: (200, 10, 0),
+        255: (224, 224, 192),
+        1: (128, 0, 0),
+        2: (0, 128, 0),
+    }
     for seed, name in enumerate(("day/a", "night/b", "night/c")):
         toys.picture(root / "JPEGImages" / f"{name}.png", seed)
         for folder, values in (("SegmentationObject", objects), ("SegmentationClass", classes)):
@@ -74,14 +84,20 @@ def test_voc_names_of_a_file_number_the_classes(tmp_path: Path) -> None:
 
 
 VOC_ERRORS = {
-    r"Segmentation: no train\.txt and val\.txt, and no": lambda r: (r / "ImageSets/Segmentation/val.txt").unlink(),
+    r"Segmentation: no train\.txt and val\.txt, and no": lambda r: (
+        r / "ImageSets/Segmentation/val.txt"
+    ).unlink(),
     r"train\.txt:2: no image 'x' in .*JPEGImages$": lambda r: toys.write(
         r / "ImageSets" / "Segmentation" / "train.txt", "a\nx\n"
     ),
-    r"SegmentationObject/a\.png: does not exist$": lambda r: (r / "SegmentationObject" / "a.png").unlink(),
-    r"SegmentationClass/a\.png: cannot be read as an image$": lambda r: toys.write(r / "SegmentationClass/a.png", "x"),
-    r"SegmentationClass/a\.png: 4x4, .*SegmentationObject/a\.png 64x48$": lambda r: toys.palette_png(
-        r / "SegmentationClass" / "a.png", np.ones((4, 4))
+    r"SegmentationObject/a\.png: does not exist$": lambda r: (
+        r / "SegmentationObject" / "a.png"
+    ).unlink(),
+    r"SegmentationClass/a\.png: cannot be read as an image$": lambda r: toys.write(
+        r / "SegmentationClass/a.png", "x"
+    ),
+    r"SegmentationClass/a\.png: 4x4, .*SegmentationObject/a\.png 64x48$": lambda r: (
+        toys.palette_png(r / "SegmentationClass" / "a.png", np.ones((4, 4)))
     ),
     r"SegmentationClass/a\.png: class 30 where there are 20$": lambda r: toys.palette_png(
         r / "SegmentationClass" / "a.png", np.full((toys.HEIGHT, toys.WIDTH), 30)
@@ -89,11 +105,21 @@ VOC_ERRORS = {
     r"SegmentationObject/a\.png: a PNG of mode I;16; a palette": lambda r: Image.fromarray(
         np.ones((toys.HEIGHT, toys.WIDTH), np.uint16)
     ).save(r / "SegmentationObject" / "a.png"),
-    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.picture(r / "JPEGImages" / "a.jpg", 1, (10, 10)),
-    r"labelmap\.txt:2: not name:R,G,B$": lambda r: toys.write(r / "labelmap.txt", "a:1,2,3::\nb:red::\n"),
-    r"labelmap\.txt:2: class 'a' is listed twice$": lambda r: toys.write(r / "labelmap.txt", "a:1,2,3::\na:4,5,6::\n"),
-    r"labelmap\.txt:2: b has the colour of a$": lambda r: toys.write(r / "labelmap.txt", "a:1,2,3::\nb:1,2,3::\n"),
-    r"labelmap\.txt: 0 classes; 1 to 254": lambda r: toys.write(r / "labelmap.txt", "background:0,0,0::\n"),
+    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.picture(
+        r / "JPEGImages" / "a.jpg", 1, (10, 10)
+    ),
+    r"labelmap\.txt:2: not name:R,G,B$": lambda r: toys.write(
+        r / "labelmap.txt", "a:1,2,3::\nb:red::\n"
+    ),
+    r"labelmap\.txt:2: class 'a' is listed twice$": lambda r: toys.write(
+        r / "labelmap.txt", "a:1,2,3::\na:4,5,6::\n"
+    ),
+    r"labelmap\.txt:2: b has the colour of a$": lambda r: toys.write(
+        r / "labelmap.txt", "a:1,2,3::\nb:1,2,3::\n"
+    ),
+    r"labelmap\.txt: 0 classes; 1 to 254": lambda r: toys.write(
+        r / "labelmap.txt", "background:0,0,0::\n"
+    ),
 }
 
 

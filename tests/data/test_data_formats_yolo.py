@@ -1,4 +1,6 @@
-"""YOLO segmentation: every way to say where, boxes, polygons that come back, and every mistake named."""
+"""YOLO segmentation: every way to say where, boxes, polygons that come back, and every mistake
+named.
+"""
 
 import tempfile
 from pathlib import Path
@@ -25,10 +27,15 @@ YAMLS = {
 @pytest.mark.parametrize("layout", YAMLS)
 def test_yolo_every_way_to_say_where(tmp_path: Path, layout: str) -> None:
     root = toys.yolo(tmp_path / "source", YAMLS[layout])
-    toys.write(root / "train.txt", "./images/train/a.png\n\nimages/train/b.png\n./images/train/c.png\n")
+    toys.write(
+        root / "train.txt", "./images/train/a.png\n\nimages/train/b.png\n./images/train/c.png\n"
+    )
     splits = converted("yolo", root)
     assert splits["train"].class_names == ("person", "car")
-    assert [file_names(splits[name]) for name in ("train", "val")] == [["a.png", "b.png", "c.png"], ["d.png"]]
+    assert [file_names(splits[name]) for name in ("train", "val")] == [
+        ["a.png", "b.png", "c.png"],
+        ["d.png"],
+    ]
 
 
 def test_yolo_labels_beside_images_and_the_yaml_itself(tmp_path: Path) -> None:
@@ -36,17 +43,25 @@ def test_yolo_labels_beside_images_and_the_yaml_itself(tmp_path: Path) -> None:
     for seed, split in enumerate(("train", "valid")):
         toys.picture(root / split / "images" / "x.png", seed)
         toys.write(root / split / "labels" / "x.txt", toys.yolo_row(0, toys.PERSON))
-    path = toys.write(root / "own.yaml", "train: ../train/images\nval: ../valid/images\nnames: [person]\n")
+    path = toys.write(
+        root / "own.yaml", "train: ../train/images\nval: ../valid/images\nnames: [person]\n"
+    )
     convert("yolo", path, tmp_path / "out")
     split = read_split("val", find_split(tmp_path / "out", "val"))
     assert file_names(split) == ["valid/images/x.png"]
-    assert np.array_equal(split.images[0].objects[0].mask(toys.HEIGHT, toys.WIDTH), drawn(toys.PERSON))
+    assert np.array_equal(
+        split.images[0].objects[0].mask(toys.HEIGHT, toys.WIDTH), drawn(toys.PERSON)
+    )
 
 
-def test_yolo_boxes_are_rectangles_and_said_aloud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_yolo_boxes_are_rectangles_and_said_aloud(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = toys.yolo(tmp_path / "source", YAMLS["folders"] + "test: images/test\n")
     labels = root / "labels" / "train"
-    toys.write(labels / "a.txt", "1 0.65625 0.5625 0.375 0.291667\n\n0 0.5 0.5 1.2 0.5\n0 2 2 2 2 2 2\n")
+    toys.write(
+        labels / "a.txt", "1 0.65625 0.5625 0.375 0.291667\n\n0 0.5 0.5 1.2 0.5\n0 2 2 2 2 2 2\n"
+    )
     (labels / "b.txt").unlink()
     splits = converted("yolo", root)
     (car, person) = masks_of(splits, "a")
@@ -72,22 +87,30 @@ def test_yolo_boxes_are_rectangles_and_said_aloud(tmp_path: Path, capsys: pytest
     centre=st.tuples(st.floats(0.3, 0.7), st.floats(0.3, 0.7)),
     radii=st.lists(st.floats(0.1, 0.29), min_size=3, max_size=30),
 )
-def test_yolo_polygons_come_back(height: int, width: int, centre: tuple[float, float], radii: list[float]) -> None:
+def test_yolo_polygons_come_back(
+    height: int, width: int, centre: tuple[float, float], radii: list[float]
+) -> None:
     angles = np.arange(len(radii)) * 2 * np.pi / len(radii)
-    star = np.stack([centre[0] + radii * np.cos(angles), centre[1] + radii * np.sin(angles)], axis=1).clip(0, 1)
+    star = np.stack(
+        [centre[0] + radii * np.cos(angles), centre[1] + radii * np.sin(angles)], axis=1
+    ).clip(0, 1)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "source"
         toys.write(root / "data.yaml", "train: images/train\nval: images/val\nnames: [star]\n")
         for split in ("train", "val"):
             toys.picture(root / "images" / split / f"{split}.png", 1, (height, width))
-            toys.write(root / "labels" / split / f"{split}.txt", " ".join(["0", *(f"{v:.9f}" for v in star.ravel())]))
+            toys.write(
+                root / "labels" / split / f"{split}.txt",
+                " ".join(["0", *(f"{v:.9f}" for v in star.ravel())]),
+            )
         (image,) = converted("yolo", root)["train"].images
     (found,) = image.objects
     exact = star * (width, height)
     np.testing.assert_allclose(np.reshape(found.segmentation, (-1, 2)), exact, atol=1e-3)
     mask = found.mask(height, width)
     assert (mask == drawn(found.segmentation[0], size=(height, width))).all()
-    # pycocotools puts corners on a grid of a fifth of a pixel: one rounded the other way moves an edge by so much
+    # pycocotools puts corners on a grid of a fifth of a pixel: one rounded the other way moves an
+    # edge by so much
     perimeter = float(np.linalg.norm(exact - np.roll(exact, -1, axis=0), axis=1).sum())
     changed = np.count_nonzero(mask != drawn(exact.ravel().tolist(), size=(height, width)))
     assert changed <= 0.2 * np.sqrt(2) * perimeter + 3

@@ -1,4 +1,6 @@
-"""Data that is legal and hard: hundreds of objects, none, single pixels, a panorama; no crash, bounded memory."""
+"""Data that is legal and hard: hundreds of objects, none, single pixels, a panorama; no crash,
+bounded memory.
+"""
 
 import subprocess
 import sys
@@ -12,8 +14,9 @@ import pytest
 
 WIDE = (3000, 12000)  # px, height and width; one mask is 36 MB
 
-# Setup, every training batch with a step on it, every validation image with its scores; prints the objects that were
-# trained on, and by how much the peak memory grew, MiB: that of what was loaded before is no matter of the data.
+# Setup, every training batch with a step on it, every validation image with its scores; prints the
+# objects that were trained on, and by how much the peak memory grew, MiB: that of what was loaded
+# before is no matter of the data.
 _TRAIN = """
 import sys
 import torch
@@ -53,8 +56,12 @@ print(objects, trained - before, peak() - before)
 """
 
 
-def folder(root: Path, images: list[list[tuple[int, int, int, int]]], size: tuple[int, int]) -> Path:
-    """A folder whose two splits are the same images of a size (height, width), px; images: the boxes of each."""
+def folder(
+    root: Path, images: list[list[tuple[int, int, int, int]]], size: tuple[int, int]
+) -> Path:
+    """A folder whose two splits are the same images of a size (height, width), px; images: the
+    boxes of each.
+    """
     (root / "images").mkdir(parents=True)
     files: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
@@ -62,7 +69,10 @@ def folder(root: Path, images: list[list[tuple[int, int, int, int]]], size: tupl
     for i, boxes in enumerate(images, 1):
         cv2.imwrite(str(root / "images" / f"{i}.jpg"), pixels)
         files.append({"id": i, "file_name": f"{i}.jpg", "height": size[0], "width": size[1]})
-        rows += [toys.rectangle(i, 10 + 10 * (k % 2), box, len(rows) + k) for k, box in enumerate(boxes, 1)]
+        rows += [
+            toys.rectangle(i, 10 + 10 * (k % 2), box, len(rows) + k)
+            for k, box in enumerate(boxes, 1)
+        ]
     content = {"images": files, "annotations": rows, "categories": toys.CATEGORIES}
     for split in ("train", "val"):
         toys.write(root / f"instances_{split}.json", content)
@@ -71,7 +81,9 @@ def folder(root: Path, images: list[list[tuple[int, int, int, int]]], size: tupl
 
 def train(root: Path) -> tuple[int, int, int]:
     """Objects trained on; growth of the peak memory in training, and with validation, MiB."""
-    done = subprocess.run([sys.executable, "-c", _TRAIN, str(root)], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", _TRAIN, str(root)], capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     objects, training, everything = (int(word) for word in done.stdout.split())
     return objects, training, everything
@@ -81,7 +93,8 @@ MANY = [(i % 25 * 25, i // 25 * 24, 20, 18) for i in range(500)]
 TINY = [(i * 7, i * 5, 1, 1) for i in range(60)]
 
 
-# Bounds in MiB; measured: 169, 83, 81, and 567 (248 in training; validation turns the image into float32).
+# Bounds in MiB; measured: 169, 83, 81, and 567 (248 in training; validation turns the image into
+# float32).
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("images", "size", "least", "bound"),
@@ -89,11 +102,17 @@ TINY = [(i * 7, i * 5, 1, 1) for i in range(60)]
         pytest.param([MANY, MANY], (480, 640), 300, 350, id="500 objects"),
         pytest.param([MANY[:3], [], [], []], (480, 640), 0, 200, id="batches without an object"),
         pytest.param([TINY, TINY], (480, 640), 0, 200, id="objects of one pixel"),
-        pytest.param([[(400 * i, 50 * i, 900, 1200) for i in range(25)]], WIDE, 5, 1000, id="12000 px wide"),
+        pytest.param(
+            [[(400 * i, 50 * i, 900, 1200) for i in range(25)]], WIDE, 5, 1000, id="12000 px wide"
+        ),
     ],
 )
 def test_hard_images_train_and_validate_in_bounded_memory(
-    tmp_path: Path, images: list[list[tuple[int, int, int, int]]], size: tuple[int, int], least: int, bound: int
+    tmp_path: Path,
+    images: list[list[tuple[int, int, int, int]]],
+    size: tuple[int, int],
+    least: int,
+    bound: int,
 ) -> None:
     objects, training, everything = train(folder(tmp_path / "a", images, size))
     assert objects >= least

@@ -16,13 +16,21 @@ PASTING = Augmentation(flip=0.0, scale_jitter=(1.0, 1.0), copy_paste=1.0, photom
 HEIGHT, WIDTH = 60, 80
 
 
-def rectangle(number: int, label: int, box: tuple[int, int, int, int], crowd: bool = False) -> CocoObject:
+def rectangle(
+    number: int, label: int, box: tuple[int, int, int, int], crowd: bool = False
+) -> CocoObject:
     x, y, w, h = box
     outline = [[x, y, x + w, y, x + w, y + h, x, y + h]]
     return CocoObject(number, label, (x, y, w, h), w * h, outline, crowd)
 
 
-def image(folder: Path, number: int, colour: int, objects: list[CocoObject], size: tuple[int, int] = (HEIGHT, WIDTH)):
+def image(
+    folder: Path,
+    number: int,
+    colour: int,
+    objects: list[CocoObject],
+    size: tuple[int, int] = (HEIGHT, WIDTH),
+):
     """A grey image with its objects' boxes in its own colour."""
     pixels = np.full((*size, 3), 20, dtype=np.uint8)
     for o in objects:
@@ -35,7 +43,9 @@ def image(folder: Path, number: int, colour: int, objects: list[CocoObject], siz
 
 @pytest.fixture
 def two(tmp_path: Path) -> list[CocoImage]:
-    """One image with a large object (label 1), one with a smaller (label 2) that would lie over its middle."""
+    """One image with a large object (label 1), one with a smaller (label 2) that would lie over its
+    middle.
+    """
     behind = image(tmp_path, 1, 100, [rectangle(1, 1, (10, 10, 60, 40))])
     before = image(tmp_path, 2, 200, [rectangle(2, 2, (30, 20, 20, 20))])
     return [behind, before]
@@ -104,7 +114,9 @@ def test_mini_masks_lie_on_their_boxes(two: list[CocoImage]) -> None:
     assert torch.equal(target["frames"], target["boxes"])
     assert (target["masks"][:, 1:-1, 1:-1] == 1).all()
     assert (target["masks"] > 0.85).all()  # half a pixel beyond the edge weighs in
-    _, none = CocoTrainSet([CocoImage(3, two[0].path, HEIGHT, WIDTH, ())], (HEIGHT, WIDTH), STILL, (28, 28))[0]
+    _, none = CocoTrainSet(
+        [CocoImage(3, two[0].path, HEIGHT, WIDTH, ())], (HEIGHT, WIDTH), STILL, (28, 28)
+    )[0]
     assert none["masks"].shape == (0, 28, 28)
     assert none["frames"].shape == (0, 4)
 

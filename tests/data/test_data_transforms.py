@@ -28,7 +28,14 @@ def picture(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 @settings(max_examples=60, deadline=None)
-@given(height=sides, width=sides, rows=sides, columns=sides, seed=st.integers(0, 99), flip=st.booleans())
+@given(
+    height=sides,
+    width=sides,
+    rows=sides,
+    columns=sides,
+    seed=st.integers(0, 99),
+    flip=st.booleans(),
+)
 def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     height: int, width: int, rows: int, columns: int, seed: int, flip: bool
 ) -> None:
@@ -43,7 +50,8 @@ def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     if mask.sum() < 9:
         return
     edge = mask.float()[None, None]
-    # Enlarged bilinearly, a corner is rounded off: (1/2 + a)^2 = 1/2 at a = .21 px of the image from both edges.
+    # Enlarged bilinearly, a corner is rounded off: (1/2 + a)^2 = 1/2 at a = .21 px of the image
+    # from both edges.
     rounded = math.ceil(0.21 * 1.5 * min(rows / height, columns / width) + 0.5)
     inside = -torch.nn.functional.max_pool2d(-edge, 2 * rounded + 1, 1, rounded)[0, 0] > 0
     near = torch.nn.functional.max_pool2d(edge, 3, 1, 1)[0, 0] > 0
@@ -79,7 +87,9 @@ def test_without_jitter_the_image_fits_and_the_rest_is_zero() -> None:
 
 def test_the_jitter_covers_its_range() -> None:
     torch.manual_seed(0)
-    placements = [Placement.draw((60, 60), (60, 60), Augmentation(0.5, (0.5, 1.5))) for _ in range(300)]
+    placements = [
+        Placement.draw((60, 60), (60, 60), Augmentation(0.5, (0.5, 1.5))) for _ in range(300)
+    ]
     scales = [p.size[0] / p.height for p in placements]
     assert 0.5 <= min(scales) < 0.53
     assert 1.47 < max(scales) <= 1.51
@@ -114,7 +124,9 @@ def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> No
 
 
 def test_a_moving_cameras_faults_leave_an_image_in_its_range() -> None:
-    """Every fault at once, on stripes: the image is another one, blurred and darker or lighter, and still an image."""
+    """Every fault at once, on stripes: the image is another one, blurred and darker or lighter, and
+    still an image.
+    """
     torch.manual_seed(0)
     faults = photometric_augmentation(Augmentation(photometric=False, degrade=1.0))
     assert faults is not None

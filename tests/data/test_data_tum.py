@@ -1,4 +1,6 @@
-"""`cohdc data tum` against a host of its own: download, resumption, checks, and archives that must not be unpacked."""
+"""`cohdc data tum` against a host of its own: download, resumption, checks, and archives that must
+not be unpacked.
+"""
 
 import hashlib
 import io
@@ -95,7 +97,9 @@ def test_a_part_that_is_too_long_is_fetched_anew(tmp_path: Path, host: str) -> N
 
 def test_what_the_host_gives_instead_of_an_archive_is_not_kept(tmp_path: Path, host: str) -> None:
     Host.content = b"<html>please log in</html>"
-    with pytest.raises(DataError, match=r"not a whole \.tgz: not a gzip file; it was deleted") as caught:
+    with pytest.raises(
+        DataError, match=r"not a whole \.tgz: not a gzip file; it was deleted"
+    ) as caught:
         tum("walking_xyz", out=tmp_path, host=host)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -118,14 +122,19 @@ def test_a_download_goes_on_where_it_was_cut_off(tmp_path: Path, host: str, rang
     Host.breaks, Host.ranges = None, ranges
     tum("walking_xyz", out=tmp_path, host=host)
     assert Host.asked == [None, "bytes=100-"]
-    assert hashlib.sha256((tmp_path / f"{NAME}.tgz").read_bytes()).digest() == hashlib.sha256(Host.content).digest()
+    assert (
+        hashlib.sha256((tmp_path / f"{NAME}.tgz").read_bytes()).digest()
+        == hashlib.sha256(Host.content).digest()
+    )
 
 
 def test_offline_it_says_what_to_fetch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["walking_xyz", "--out", str(tmp_path), "--host", "http://127.0.0.1:1"]
     assert main(["data", "tum", *arguments]) == 1
     said = capsys.readouterr().err.strip()
-    assert said.startswith(f"cohdc data: http://127.0.0.1:1/freiburg3/{NAME}.tgz: cannot be fetched")
+    assert said.startswith(
+        f"cohdc data: http://127.0.0.1:1/freiburg3/{NAME}.tgz: cannot be fetched"
+    )
     assert said.count("\n") == 0
     assert "--archive FILE" in said
     assert list(tmp_path.iterdir()) == []
@@ -143,15 +152,29 @@ def test_damaged_and_incomplete_archives_leave_nothing(tmp_path: Path) -> None:
     whole = archive(FILES)
     refused(tmp_path, whole[: len(whole) // 2], r"given\.tgz: not a whole \.tgz")
     refused(tmp_path, b"no archive", r"given\.tgz: not a whole \.tgz")
-    refused(tmp_path, archive({k: v for k, v in FILES.items() if k != "rgb/2.0.png"}), r"rgb\.txt line 3: '2\.0 rgb/2")
-    refused(tmp_path, archive({k: v for k, v in FILES.items() if k != "groundtruth.txt"}), r"no groundtruth\.txt")
+    refused(
+        tmp_path,
+        archive({k: v for k, v in FILES.items() if k != "rgb/2.0.png"}),
+        r"rgb\.txt line 3: '2\.0 rgb/2",
+    )
+    refused(
+        tmp_path,
+        archive({k: v for k, v in FILES.items() if k != "groundtruth.txt"}),
+        r"no groundtruth\.txt",
+    )
     refused(tmp_path, archive(FILES | {"rgb.txt": b"\xff\xfe"}), r"given\.tgz: rgb\.txt is no text")
-    refused(tmp_path, archive(FILES | {"rgb.txt": b"", "depth.txt": b""}), "its lists name no image")
+    refused(
+        tmp_path, archive(FILES | {"rgb.txt": b"", "depth.txt": b""}), "its lists name no image"
+    )
     refused(tmp_path, whole, "SHA-256 [0-9a-f]{64}, expected 00", digest="00")
 
 
 def test_archives_that_lead_outside_are_refused(tmp_path: Path) -> None:
-    up, absolute, link = tarfile.TarInfo(f"{NAME}/../../evil"), tarfile.TarInfo("/evil"), tarfile.TarInfo(f"{NAME}/l")
+    up, absolute, link = (
+        tarfile.TarInfo(f"{NAME}/../../evil"),
+        tarfile.TarInfo("/evil"),
+        tarfile.TarInfo(f"{NAME}/l"),
+    )
     link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
     for member in (up, absolute, link):
         refused(tmp_path, archive(FILES, member), "is a link or leads out of the folder")
@@ -163,7 +186,11 @@ def test_a_given_archive_needs_no_host_and_its_digest_may_be_asked_for(tmp_path:
     file.write_bytes(archive(FILES))
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     folder = tum(
-        "walking_xyz", out=tmp_path / "out", archive=file, digest=digest.upper(), host="http://nowhere.invalid"
+        "walking_xyz",
+        out=tmp_path / "out",
+        archive=file,
+        digest=digest.upper(),
+        host="http://nowhere.invalid",
     )
     assert (folder / "rgb.txt").is_file()
 

@@ -1,4 +1,6 @@
-"""The HDC ResNet is torchvision's ResNet with other dilations: same tensors, same strides, whole coverage."""
+"""The HDC ResNet is torchvision's ResNet with other dilations: same tensors, same strides, whole
+coverage.
+"""
 
 import pytest
 import torch
@@ -33,7 +35,9 @@ def test_dilation_keeps_strides_and_channels(depth):
     backbone = HDCResNet(depth, width=0.25).eval()
     features = backbone(torch.zeros(1, 3, 64, 128))
     sides = [tuple(f.shape[1:]) for f in features.values()]
-    assert sides == [(c, 64 // s, 128 // s) for c, s in zip(backbone.out_channels, (4, 8, 16, 32), strict=True)]
+    assert sides == [
+        (c, 64 // s, 128 // s) for c, s in zip(backbone.out_channels, (4, 8, 16, 32), strict=True)
+    ]
 
 
 def test_the_strided_convolution_keeps_rate_one_and_the_pattern_follows():
@@ -60,7 +64,9 @@ def test_frozen_stages_learn_nothing_and_keep_their_statistics():
     backbone(torch.rand(2, 3, 64, 64))["3"].sum().backward()
     optimizer.step()
     changed = {
-        name.split(".")[0] for name, value in backbone.state_dict().items() if not torch.equal(value, before[name])
+        name.split(".")[0]
+        for name, value in backbone.state_dict().items()
+        if not torch.equal(value, before[name])
     }
     assert changed == {"layer2", "layer3", "layer4"}
 
@@ -79,7 +85,12 @@ def test_a_missing_file_lists_the_published_names(tmp_path):
 def test_mobilenets_strides_channels_and_pattern():
     backbone = MobileNetV1(width=0.25, rates=((1, 2, 3),) * 4, frozen_stages=1).eval()
     features = backbone(torch.zeros(1, 3, 64, 128))
-    assert [tuple(f.shape[1:]) for f in features.values()] == [(32, 16, 32), (64, 8, 16), (128, 4, 8), (256, 2, 4)]
+    assert [tuple(f.shape[1:]) for f in features.values()] == [
+        (32, 16, 32),
+        (64, 8, 16),
+        (128, 4, 8),
+        (256, 2, 4),
+    ]
     # behind each strided convolution the pattern begins; the first stage has one before its stride
     assert backbone.rates() == [(1, 1, 2), (1, 1), (1, 1, 2, 3, 1, 2), (1, 1)]
     assert not any(p.requires_grad for p in backbone.stem_block.parameters())
@@ -123,14 +134,21 @@ def test_mobilenets_receptive_field_is_what_a_gradient_reaches():
 
 
 def test_mobilenet_sees_pixels_from_minus_one_to_one_padded_below_and_right():
-    """With a stem that copies its kernel's last corner, the stem's output is the pixel below and to the right."""
+    """With a stem that copies its kernel's last corner, the stem's output is the pixel below and to
+    the right.
+    """
     body = MobileNetV1().eval()
     with torch.no_grad():
         body.stem_block.conv.weight.zero_()
-        body.stem_block.conv.weight[:, 1, 1, 1] = 1.0  # green, the kernel's centre: pixels 1, 3, 5 ...
+        body.stem_block.conv.weight[:, 1, 1, 1] = (
+            1.0  # green, the kernel's centre: pixels 1, 3, 5 ...
+        )
     green = torch.arange(64.0).repeat(64, 1) / 63
     image = torch.stack([torch.zeros(64, 64), green, torch.zeros(64, 64)])
-    mean, std = torch.tensor([0.485, 0.456, 0.406])[:, None, None], torch.tensor([0.229, 0.224, 0.225])[:, None, None]
+    mean, std = (
+        torch.tensor([0.485, 0.456, 0.406])[:, None, None],
+        torch.tensor([0.229, 0.224, 0.225])[:, None, None],
+    )
     seen = body.stem(((image - mean) / std)[None])[0, 0, 0]
     expected = (2 * green[0, 1::2] - 1).clamp(0, 6) / (1 + 1e-3) ** 0.5
     torch.testing.assert_close(seen, expected, atol=1e-5, rtol=0)
@@ -138,7 +156,9 @@ def test_mobilenet_sees_pixels_from_minus_one_to_one_padded_below_and_right():
 
 def test_mobilenets_weights_load_by_path_only(tmp_path):
     source = MobileNetV1()
-    state = {name.replace("stem_block.", "stem."): value for name, value in source.state_dict().items()}
+    state = {
+        name.replace("stem_block.", "stem."): value for name, value in source.state_dict().items()
+    }
     torch.save(state | {"fc.weight": torch.zeros(1)}, tmp_path / "m.pth")
     target = MobileNetV1(norm="frozen")
     target.load(str(tmp_path / "m.pth"))
@@ -146,12 +166,15 @@ def test_mobilenets_weights_load_by_path_only(tmp_path):
     with pytest.raises(FileNotFoundError, match="torchvision publishes none"):
         MobileNetV1().load("IMAGENET1K_V1")
     torch.save({"fc.weight": torch.zeros(1)}, tmp_path / "empty.pth")
-    with pytest.raises(ValueError, match=r"empty\.pth: no tensor .* these are not MobileNetV1 weights"):
+    with pytest.raises(
+        ValueError, match=r"empty\.pth: no tensor .* these are not MobileNetV1 weights"
+    ):
         MobileNetV1().load(str(tmp_path / "empty.pth"))
 
 
 @pytest.mark.parametrize(
-    ("depth", "rates", "side"), [(18, [(1,)] * 4, 435), (50, [(1,)] * 4, 427), (34, [(1, 2, 3)] * 4, 1619)]
+    ("depth", "rates", "side"),
+    [(18, [(1,)] * 4, 435), (50, [(1,)] * 4, 427), (34, [(1, 2, 3)] * 4, 1619)],
 )
 def test_the_receptive_field(depth, rates, side):
     assert HDCResNet(depth, width=0.125, rates=rates).receptive_field() == side
@@ -172,7 +195,9 @@ def test_frozen_norms_keep_half_precision_and_compute_torchvisions_values():
         buffer.uniform_(0.5, 2.0)
         reference.get_buffer(name).copy_(buffer)
     image = torch.rand(2, 5, 6, 7)
-    torch.testing.assert_close(norm(image), reference(image), rtol=1e-6, atol=1e-6)  # one pass rounds differently
+    torch.testing.assert_close(
+        norm(image), reference(image), rtol=1e-6, atol=1e-6
+    )  # one pass rounds differently
     half = image.bfloat16().requires_grad_()
     out = norm(half)
     assert out.dtype == torch.bfloat16

@@ -15,7 +15,9 @@ def test_loss_is_half_the_squared_error_over_positive_targets():
 def test_without_a_positive_the_loss_is_zero_and_reaches_every_parameter():
     head = CQEHead(8, 2, channels=8, fc=16)
     loss = cqe_loss(
-        head(torch.rand(0, 8, 14, 14), torch.rand(0, 28, 28)), torch.zeros(0, dtype=torch.long), torch.zeros(0)
+        head(torch.rand(0, 8, 14, 14), torch.rand(0, 28, 28)),
+        torch.zeros(0, dtype=torch.long),
+        torch.zeros(0),
     )
     loss.backward()
     assert loss.item() == 0.0

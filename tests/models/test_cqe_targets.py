@@ -31,7 +31,9 @@ def test_a_perfect_mask_in_a_tight_box_has_quality_one():
 
 
 def test_truth_outside_the_box_counts():
-    """The box holds half of the object and the mask fills it: IoU 1/2 with the whole, though 1 inside the box."""
+    """The box holds half of the object and the mask fills it: IoU 1/2 with the whole, though 1
+    inside the box.
+    """
     box = torch.tensor([[10.0, 20.0, 30.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(0.5, abs=0.01)
@@ -45,7 +47,9 @@ def test_a_mask_larger_than_the_object_is_punished():
 
 def test_an_empty_mask_has_quality_zero():
     box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
-    assert cqe_targets(torch.zeros(1, 28, 28), box, _true(_scene()), torch.tensor([0])).item() == 0.0
+    assert (
+        cqe_targets(torch.zeros(1, 28, 28), box, _true(_scene()), torch.tensor([0])).item() == 0.0
+    )
 
 
 def test_each_box_is_held_against_its_own_object():
@@ -65,8 +69,11 @@ def test_ciou_of_a_perfect_mask_is_one():
 
 
 def test_ciou_of_a_shifted_mask():
-    # 40 x 40 against 40 x 40, 10 px to the right: IoU 30 / 50, rho^2 = 100, c^2 = 50^2 + 40^2, same aspect
-    assert _ciou_target([20.0, 20.0, 60.0, 60.0]) == pytest.approx(0.5 * (1 + 0.6 - 100 / 4100), abs=1e-5)
+    # 40 x 40 against 40 x 40, 10 px to the right: IoU 30 / 50, rho^2 = 100, c^2 = 50^2 + 40^2, same
+    # aspect
+    assert _ciou_target([20.0, 20.0, 60.0, 60.0]) == pytest.approx(
+        0.5 * (1 + 0.6 - 100 / 4100), abs=1e-5
+    )
 
 
 def test_ciou_of_a_mask_of_another_aspect():
@@ -92,12 +99,18 @@ def test_ciou_target_of_masks_that_do_not_meet_is_zero():
 def test_ciou_never_exceeds_iou(corner, extent, seed):
     box = torch.tensor([[*corner, corner[0] + extent[0], corner[1] + extent[1]]])
     mask = torch.rand((1, 28, 28), generator=torch.Generator().manual_seed(seed))
-    iou, both = (cqe_targets(mask, box, _true(_scene()), torch.tensor([0]), kind).item() for kind in ("iou", "ciou"))
+    iou, both = (
+        cqe_targets(mask, box, _true(_scene()), torch.tensor([0]), kind).item()
+        for kind in ("iou", "ciou")
+    )
     assert 0 <= both <= 0.5 * (1 + iou) + 1e-6
     assert (both > 0) == (iou > 0)
 
 
-blobs = st.lists(st.tuples(st.integers(0, 44), st.integers(0, 56), st.integers(1, 40), st.integers(1, 40)), max_size=3)
+blobs = st.lists(
+    st.tuples(st.integers(0, 44), st.integers(0, 56), st.integers(1, 40), st.integers(1, 40)),
+    max_size=3,
+)
 
 
 def _drawn(rectangles, size=(48, 64)):
@@ -111,7 +124,10 @@ def _drawn(rectangles, size=(48, 64)):
 @given(blobs, blobs)
 def test_boundary_iou_is_what_boundary_ap_counts(one, other):
     a, b = _drawn(one), _drawn(other)
-    bands = [oracle.rleToBoundary(oracle.encode(np.asfortranarray(m.numpy(), dtype=np.uint8))) for m in (a, b)]
+    bands = [
+        oracle.rleToBoundary(oracle.encode(np.asfortranarray(m.numpy(), dtype=np.uint8)))
+        for m in (a, b)
+    ]
     expected = float(oracle.iou([bands[0]], [bands[1]], [0])[0, 0]) if a.any() or b.any() else 0.0
     assert boundary_iou(a, b, band_of(48, 64)).item() == pytest.approx(expected, abs=1e-6)
 
@@ -125,24 +141,36 @@ def test_the_edge_of_the_image_is_contour():
 def _laid_over(mask, box, size):
     """cohdc_train.masks.paste_roi_mask, exactly."""
     y, x = (np.arange(n) + 0.5 for n in size)
-    u, v = ((at - low) / (high - low) * 28 - 0.5 for at, low, high in ((x, box[0], box[2]), (y, box[1], box[3])))
+    u, v = (
+        (at - low) / (high - low) * 28 - 0.5
+        for at, low, high in ((x, box[0], box[2]), (y, box[1], box[3]))
+    )
     sampled = map_coordinates(mask, np.meshgrid(v, u, indexing="ij"), order=1, mode="nearest")
     inside = ((y >= box[1]) & (y < box[3]))[:, None] & (x >= box[0]) & (x < box[2])
     return torch.from_numpy((sampled > 0.5) & inside)
 
 
 @settings(max_examples=40, deadline=None)
-@given(blobs.filter(bool), st.tuples(*[st.floats(-4, 30)] * 2), st.tuples(*[st.floats(4, 34)] * 2), st.integers(0, 99))
+@given(
+    blobs.filter(bool),
+    st.tuples(*[st.floats(-4, 30)] * 2),
+    st.tuples(*[st.floats(4, 34)] * 2),
+    st.integers(0, 99),
+)
 @example(rectangles=[(17, 1, 31, 2)], corner=(0.0, 18.0), extent=(4.0, 31.0), seed=2)
 def test_targets_on_the_canvas_are_those_of_the_pasted_mask(rectangles, corner, extent, seed):
-    """What `encode` pastes and Boundary AP scores is what the head is told, also where the box leaves the canvas.
+    """What `encode` pastes and Boundary AP scores is what the head is told, also where the box
+    leaves the canvas.
 
-    Held against the paste's rule in double precision: OpenCV's own takes coordinates to a 32nd of a cell.
+    Held against the paste's rule in double precision: OpenCV's own takes coordinates to a 32nd of a
+    cell.
     """
     truth = _drawn(rectangles)
     box = torch.tensor([corner[0], corner[1], corner[0] + extent[0], corner[1] + extent[1]])
     mask = torch.nn.functional.interpolate(
-        torch.rand((1, 1, 4, 4), generator=torch.Generator().manual_seed(seed)), (28, 28), mode="bilinear"
+        torch.rand((1, 1, 4, 4), generator=torch.Generator().manual_seed(seed)),
+        (28, 28),
+        mode="bilinear",
     )[0]
     pasted = _laid_over(mask[0].numpy().astype(float), (box + 10).numpy().astype(float), (68, 84))
     whole = torch.zeros(68, 84, dtype=torch.bool)
@@ -151,13 +179,19 @@ def test_targets_on_the_canvas_are_those_of_the_pasted_mask(rectangles, corner, 
     boundary = boundary_iou(pasted, whole, 2).item()
     true, matched = _true(truth[None].to(torch.uint8)), torch.tensor([0])
     # a pixel whose value lies on .5 to the last bit may fall to either side
-    assert cqe_targets(mask, box[None], true, matched, "boundary_iou", [2]).item() == pytest.approx(boundary, abs=0.02)
-    assert cqe_targets(mask, box[None], true, matched, "min", [2]).item() == pytest.approx(min(iou, boundary), abs=0.02)
+    assert cqe_targets(mask, box[None], true, matched, "boundary_iou", [2]).item() == pytest.approx(
+        boundary, abs=0.02
+    )
+    assert cqe_targets(mask, box[None], true, matched, "min", [2]).item() == pytest.approx(
+        min(iou, boundary), abs=0.02
+    )
 
 
 def _mini(mask, side=56):
     rows, columns = (torch.nonzero(mask.any(dim=d))[:, 0] for d in (1, 0))
-    frame = torch.tensor([[columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]], dtype=torch.float32)
+    frame = torch.tensor(
+        [[columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]], dtype=torch.float32
+    )
     whole = TrueMasks(mask[None], torch.tensor([[0.0, 0.0, mask.shape[1], mask.shape[0]]]))
     rasters = whole.within(frame, torch.tensor([0]), (side, side)).half()
     return TrueMasks.of({"masks": rasters, "frames": frame}, torch.tensor([0]))
@@ -179,11 +213,20 @@ def test_a_mini_mask_stands_for_the_whole_one():
 
 def test_projection_of_a_mini_mask_known_answer():
     """A 2 x 2 mini-mask over 20 x 20 px whose left half is full: half of it, and nothing beside it."""
-    target = {"masks": torch.tensor([[[1.0, 0.0], [1.0, 0.0]]]), "frames": torch.tensor([[10.0, 10.0, 30.0, 30.0]])}
+    target = {
+        "masks": torch.tensor([[[1.0, 0.0], [1.0, 0.0]]]),
+        "frames": torch.tensor([[10.0, 10.0, 30.0, 30.0]]),
+    }
     mini = TrueMasks.of(target, torch.tensor([0]))
     assert mini.areas().tolist() == [200.0]
-    assert mini.within(torch.tensor([[10.0, 10.0, 30.0, 30.0]]), torch.tensor([0]), (1, 1)).item() == 0.5
-    assert mini.within(torch.tensor([[40.0, 10.0, 60.0, 30.0]]), torch.tensor([0]), (1, 1)).item() == 0.0
+    assert (
+        mini.within(torch.tensor([[10.0, 10.0, 30.0, 30.0]]), torch.tensor([0]), (1, 1)).item()
+        == 0.5
+    )
+    assert (
+        mini.within(torch.tensor([[40.0, 10.0, 60.0, 30.0]]), torch.tensor([0]), (1, 1)).item()
+        == 0.0
+    )
 
 
 def test_frames_must_fit_the_rasters():

@@ -1,4 +1,6 @@
-"""The copy that validation runs: the same detections, no norm left, and nothing of it in the network it was made of."""
+"""The copy that validation runs: the same detections, no norm left, and nothing of it in the
+network it was made of.
+"""
 
 import copy
 
@@ -8,7 +10,12 @@ from torch import nn
 from torchvision.ops import FrozenBatchNorm2d
 
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
-from cohdc_train.models.frozen_norm import FoldingConv2d, FrozenNorm, conv_norm_pairs, plain_convolution
+from cohdc_train.models.frozen_norm import (
+    FoldingConv2d,
+    FrozenNorm,
+    conv_norm_pairs,
+    plain_convolution,
+)
 
 SHAPES = {
     "resnet18": {"depth": 18, "width": 0.25},
@@ -20,10 +27,19 @@ SHAPES = {
 
 def network_of(shape, norm):
     torch.manual_seed(0)
-    small = {"canvas": (96, 128), "fpn_channels": 16, "fc": 32, "proposals": (50, 20), "detections": 10}
+    small = {
+        "canvas": (96, 128),
+        "fpn_channels": 16,
+        "fc": 32,
+        "proposals": (50, 20),
+        "detections": 10,
+    }
     head_norm = "batch" if shape == "resnet50" else "none"
     network = MaskRCNN(
-        3, NetworkConfig(**SHAPES[shape], **small, norm=norm, head_norm=head_norm, score_threshold=0.0)
+        3,
+        NetworkConfig(
+            **SHAPES[shape], **small, norm=norm, head_norm=head_norm, score_threshold=0.0
+        ),
     ).eval()
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d | FrozenNorm):
@@ -38,7 +54,10 @@ def network_of(shape, norm):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_it_finds_what_the_network_finds(shape, norm):
     network = network_of(shape, norm)
-    images = [torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8), torch.zeros((3, 40, 90), dtype=torch.uint8)]
+    images = [
+        torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8),
+        torch.zeros((3, 40, 90), dtype=torch.uint8),
+    ]
     for ours, theirs in zip(detect(fused(network), images), detect(network, images), strict=True):
         assert len(theirs["boxes"]) > 0
         for name in theirs:
@@ -73,7 +92,9 @@ def test_frozen_norms_are_applied_by_the_convolutions_with_equal_gradients(shape
     reference = copy.deepcopy(network)
     for module, name, norm_name in list(conv_norm_pairs(reference)):
         plain_convolution(getattr(module, name))
-        norm = FrozenBatchNorm2d(getattr(module, norm_name).weight.numel(), getattr(module, norm_name).eps)
+        norm = FrozenBatchNorm2d(
+            getattr(module, norm_name).weight.numel(), getattr(module, norm_name).eps
+        )
         norm.load_state_dict(getattr(module, norm_name).state_dict())
         setattr(module, norm_name, norm)
     assert any(isinstance(module, FoldingConv2d) for module in network.modules())
@@ -84,5 +105,7 @@ def test_frozen_norms_are_applied_by_the_convolutions_with_equal_gradients(shape
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
     ours.square().mean().backward()
     theirs.square().mean().backward()
-    for (name, parameter), other in zip(network.named_parameters(), reference.parameters(), strict=True):
+    for (name, parameter), other in zip(
+        network.named_parameters(), reference.parameters(), strict=True
+    ):
         torch.testing.assert_close(parameter.grad, other.grad, rtol=1e-3, atol=1e-4, msg=name)

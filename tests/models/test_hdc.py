@@ -1,4 +1,6 @@
-"""Eq. 1 and exact coverage: known answers, and the truth by pushing an impulse through real convolutions."""
+"""Eq. 1 and exact coverage: known answers, and the truth by pushing an impulse through real
+convolutions.
+"""
 
 import pytest
 import torch
@@ -40,7 +42,9 @@ def test_holes_are_what_an_impulse_through_convolutions_misses(rates):
 
 
 def test_a_bad_pattern_is_refused_with_its_holes():
-    with pytest.raises(ValueError, match=r"\(2, 2, 2, 2\) leave holes: offsets \+-\(1, 3, 5, 7\) px"):
+    with pytest.raises(
+        ValueError, match=r"\(2, 2, 2, 2\) leave holes: offsets \+-\(1, 3, 5, 7\) px"
+    ):
         cycle((2,), 4)
 
 

@@ -1,4 +1,6 @@
-"""The network against torchvision's own Mask R-CNN, its losses at the edges, and that it can learn two pictures."""
+"""The network against torchvision's own Mask R-CNN, its losses at the edges, and that it can learn
+two pictures.
+"""
 
 import copy
 import dataclasses
@@ -70,11 +72,16 @@ def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
 
 
 @pytest.mark.parametrize("backbone", ["mobilenet_v1", "mobilenet_v2"])
-def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector_finds(backbone, small_config):
+def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector_finds(
+    backbone, small_config
+):
     torch.manual_seed(0)
-    changed = {"backbone": backbone, "rates": ((1,),) * 4, "finest_stride": 8, "anchor_scales": (32, 64, 128)} | {
-        "score_threshold": 0.1
-    }
+    changed = {
+        "backbone": backbone,
+        "rates": ((1,),) * 4,
+        "finest_stride": 8,
+        "anchor_scales": (32, 64, 128),
+    } | {"score_threshold": 0.1}
     network = MaskRCNN(2, dataclasses.replace(small_config, **changed))
     losses = network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])])
     sum(losses.values()).backward()
@@ -83,7 +90,9 @@ def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector
     with torch.no_grad():
         network.rpn.head.cls_logits.weight.mul_(3)
         network.rpn.head.bbox_pred.weight.mul_(10)
-    image = (torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0] * 255).to(torch.uint8)
+    image = (torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0] * 255).to(
+        torch.uint8
+    )
     _assert_finds_what_torchvision_finds(network, image)
 
 
@@ -97,7 +106,9 @@ def test_anchors_equal_torchvisions(opinionated):
         torch.testing.assert_close(anchors, expected[level])
 
 
-@pytest.mark.parametrize("canvas", [(96, 128), (80, 120)])  # the second is padded for the network, not for its anchors
+@pytest.mark.parametrize(
+    "canvas", [(96, 128), (80, 120)]
+)  # the second is padded for the network, not for its anchors
 def test_proposals_and_their_losses_are_torchvisions(opinionated, canvas):
     torch.manual_seed(3)
     images, rpn = torch.rand(2, 3, *canvas), copy.deepcopy(opinionated.rpn).train()
@@ -106,9 +117,13 @@ def test_proposals_and_their_losses_are_torchvisions(opinionated, canvas):
         features = opinionated.features(images)
     theirs = RegionProposalNetwork.forward
     generator = torch.random.get_rng_state()
-    proposals, objectness, boxes = rpn(canvas, list(features.values()), targets, opinionated.config.proposals[0])
+    proposals, objectness, boxes = rpn(
+        canvas, list(features.values()), targets, opinionated.config.proposals[0]
+    )
     torch.random.set_rng_state(generator)
-    expected, losses = theirs(rpn, ImageList(torch.zeros(2, 3, 96, 128), [canvas] * 2), features, targets)
+    expected, losses = theirs(
+        rpn, ImageList(torch.zeros(2, 3, 96, 128), [canvas] * 2), features, targets
+    )
     torch.testing.assert_close(objectness, losses["loss_objectness"])
     torch.testing.assert_close(boxes, losses["loss_rpn_box_reg"])
     for found, wanted in zip(proposals, expected, strict=True):
@@ -132,8 +147,12 @@ def test_padding_is_zero_and_scores_fall(opinionated):
 
 @given(seed=st.integers(0, 2**32 - 1), sharpness=st.floats(1.0, 4.0))
 def test_a_mask_cut_by_the_best_expected_iou_is_the_mask_that_has_it(seed, sharpness):
-    """Of all cuts of one mask, tried one by one. Expected: of the intersection over that of the union."""
-    p = (sharpness * torch.randn(12, 12, generator=torch.Generator().manual_seed(seed)).double()).sigmoid()
+    """Of all cuts of one mask, tried one by one. Expected: of the intersection over that of the
+    union.
+    """
+    p = (
+        sharpness * torch.randn(12, 12, generator=torch.Generator().manual_seed(seed)).double()
+    ).sigmoid()
     best_first = p.flatten().sort(descending=True).values
     inside = best_first.cumsum(0)
     united = torch.arange(1, 145) + p.sum() - inside
@@ -149,14 +168,19 @@ def test_a_perfect_mask_is_cut_at_half_and_no_mask_below_a_fifth():
 
 
 def test_cutting_by_quality_moves_masks_and_nothing_else(opinionated):
-    images = torch.randint(0, 255, (1, 80, 60, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    images = torch.randint(
+        0, 255, (1, 80, 60, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
+    )
     by_quality = MaskRCNN(2, dataclasses.replace(opinionated.config, mask_cut="quality")).eval()
     by_quality.load_state_dict(opinionated.state_dict())
     with torch.inference_mode():
         *found, masks, count = Detector(opinionated)(images)
         *others, moved, other_count = Detector(by_quality)(images)
     quality, n = found[-1], int(count[0])
-    assert all(torch.equal(one, other) for one, other in zip([*found, count], [*others, other_count], strict=True))
+    assert all(
+        torch.equal(one, other)
+        for one, other in zip([*found, count], [*others, other_count], strict=True)
+    )
     torch.testing.assert_close(moved[0, :n], cut_by_quality(masks[0, :n], quality[0, :n]))
     assert not moved[0, n:].any()
     assert (moved[0, :n] - masks[0, :n]).max() > 0.01
@@ -166,10 +190,15 @@ def test_only_detections_go_through_the_mask_and_cqe_heads(opinionated):
     passed = {"mask": 0, "cqe": 0}
     heads = {"mask": opinionated.roi_heads.mask_head, "cqe": opinionated.cqe}
     hooks = [
-        module.register_forward_pre_hook(lambda _, inputs, name=name: passed.update({name: len(inputs[0])}))
+        module.register_forward_pre_hook(
+            lambda _, inputs, name=name: passed.update({name: len(inputs[0])})
+        )
         for name, module in heads.items()
     ]
-    black, noise = torch.zeros(3, 80, 60, dtype=torch.uint8), torch.randint(0, 255, (3, 80, 60), dtype=torch.uint8)
+    black, noise = (
+        torch.zeros(3, 80, 60, dtype=torch.uint8),
+        torch.randint(0, 255, (3, 80, 60), dtype=torch.uint8),
+    )
     with torch.inference_mode():
         found = detect(opinionated, [black, noise, noise.flip(2)])
     for hook in hooks:
@@ -183,14 +212,18 @@ def test_only_detections_go_through_the_mask_and_cqe_heads(opinionated):
 def test_boxes_stay_inside_an_image_of_any_shape(opinionated):
     with torch.inference_mode():
         for height, width in ((31, 200), (200, 31), (96, 128)):
-            found = detect(opinionated, [torch.randint(0, 255, (3, height, width), dtype=torch.uint8)])[0]
+            found = detect(
+                opinionated, [torch.randint(0, 255, (3, height, width), dtype=torch.uint8)]
+            )[0]
             limit = torch.tensor([width, height, width, height]) + 1e-3
             assert torch.all(found["boxes"] >= 0)
             assert torch.all(found["boxes"] <= limit)
 
 
 @pytest.mark.parametrize("head_norm", ["none", "batch"])
-def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter(small_config, head_norm):
+def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter(
+    small_config, head_norm
+):
     network = MaskRCNN(1, dataclasses.replace(small_config, head_norm=head_norm))
     losses = network.losses(torch.rand(2, 3, 96, 128), [_target([]), _target([])])
     sum(losses.values()).backward()
@@ -202,7 +235,9 @@ def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter
 
 def test_new_norms_are_trained_beside_a_frozen_backbone(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, norm="frozen", head_norm="batch"))
-    trained = [name for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)]
+    trained = [
+        name for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)
+    ]
     assert {name.rpartition("_blocks")[0] for name in trained if "fpn" in name} == {
         "backbone.fpn.inner",
         "backbone.fpn.layer",
@@ -221,8 +256,13 @@ def test_a_canvas_that_is_no_multiple_of_32_is_padded(small_config):
 def test_background_inside_a_crowd_is_no_negative(small_config):
     network = MaskRCNN(1, small_config)
     anchors = [torch.tensor([[0.0, 0, 20, 20], [64.0, 64, 96, 96], [10.0, 10, 40, 40]])]
-    plain, crowded = _target([[10, 10, 40, 40]]), _target([[10, 10, 40, 40]], ignore=[[60, 60, 100, 96]])
-    labels = [network.rpn.assign_targets_to_anchors(anchors, [t])[0][0].tolist() for t in (plain, crowded)]
+    plain, crowded = (
+        _target([[10, 10, 40, 40]]),
+        _target([[10, 10, 40, 40]], ignore=[[60, 60, 100, 96]]),
+    )
+    labels = [
+        network.rpn.assign_targets_to_anchors(anchors, [t])[0][0].tolist() for t in (plain, crowded)
+    ]
     assert labels[0] == [0.0, 0.0, 1.0]
     assert labels[1] == [0.0, -1.0, 1.0]
 
@@ -257,7 +297,9 @@ def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
 
 def test_masks_of_56_cells_train_and_are_given(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, mask_size=56, cqe="add"))
-    sum(network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])]).values()).backward()
+    sum(
+        network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])]).values()
+    ).backward()
     assert network.roi_heads.mask_predictor.conv6_mask.weight.grad.abs().sum() > 0
     found = detect(network.eval(), [torch.randint(0, 255, (3, 96, 128), dtype=torch.uint8)])[0]
     assert found["masks"].shape[1:] == (56, 56)
@@ -300,16 +342,22 @@ def test_a_config_that_cannot_be_built_is_refused(change, message):
 
 
 def test_it_learns_two_pictures_and_its_quality_tells_the_truth(small_config):
-    """Overfit: after a hundred steps both boxes are found, masks fit, and CQE's estimate is near the true IoU."""
+    """Overfit: after a hundred steps both boxes are found, masks fit, and CQE's estimate is near
+    the true IoU.
+    """
     torch.manual_seed(0)
-    network = MaskRCNN(1, dataclasses.replace(small_config, width=0.5, fpn_channels=32, fc=64, score_threshold=0.3))
+    network = MaskRCNN(
+        1, dataclasses.replace(small_config, width=0.5, fpn_channels=32, fc=64, score_threshold=0.3)
+    )
     pictures = torch.full((2, 3, 96, 128), 0.3)
     corners = [[20, 16, 60, 80], [70, 30, 116, 70]]
     for picture, (x0, y0, x1, y1) in zip(pictures, corners, strict=True):
         picture[:, y0:y1, x0:x1] = torch.tensor([0.9, 0.2, 0.1])[:, None, None]
     targets = [_target([corner]) for corner in corners]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, total_iters=100)  # to end where it has settled
+    schedule = torch.optim.lr_scheduler.LinearLR(
+        optimizer, 1.0, 0.1, total_iters=100
+    )  # to end where it has settled
     for _ in range(100):
         optimizer.zero_grad()
         sum(network.losses(pictures, targets).values()).backward()

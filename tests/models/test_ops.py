@@ -12,7 +12,9 @@ from cohdc_train.models.ops import nms_keep, nms_keep_at_once
 def test_suppressing_all_images_at_once_keeps_what_one_after_the_other_does(seed, images, count):
     generator = torch.Generator().manual_seed(seed)
     corner = torch.rand(images, count, 2, generator=generator) * 500
-    boxes = torch.cat([corner, corner + torch.rand(images, count, 2, generator=generator) * 200], dim=2)
+    boxes = torch.cat(
+        [corner, corner + torch.rand(images, count, 2, generator=generator) * 200], dim=2
+    )
     scores = torch.rand(images, count, generator=generator)
     at_once = nms_keep_at_once(boxes, scores, 0.5, 0.3)
     assert torch.equal(at_once, nms_keep(boxes, scores, 0.5, 0.3))

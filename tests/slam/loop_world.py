@@ -20,12 +20,21 @@ def hall(seed: int = 3) -> list[Rectangle]:
         ahead = np.array([np.sin(turn), 0.0, np.cos(turn)])
         right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
         keypoint = _HALF * (ahead - right) + np.array([0.0, -1.4, 0.0])
-        walls.append(Rectangle(keypoint, 2 * _HALF * right, np.array([0.0, 2.8, 0.0]), texture(rng, 460, 1200, 4800)))
+        walls.append(
+            Rectangle(
+                keypoint,
+                2 * _HALF * right,
+                np.array([0.0, 2.8, 0.0]),
+                texture(rng, 460, 1200, 4800),
+            )
+        )
     return walls
 
 
 def way_round(frames: int, turns: float = 1.1) -> NDArray[np.float64]:
-    """[frames, 4, 4] T_wc of a camera that looks outwards on its way round; the first pose is a turn about nothing."""
+    """[frames, 4, 4] T_wc of a camera that looks outwards on its way round; the first pose is a
+    turn about nothing.
+    """
     angle = np.linspace(0, turns * 2 * np.pi, frames)
     T_wc = np.tile(np.eye(4), (frames, 1, 1))
     T_wc[:, 0, 0], T_wc[:, 0, 2] = np.cos(angle), np.sin(angle)
@@ -36,7 +45,11 @@ def way_round(frames: int, turns: float = 1.1) -> NDArray[np.float64]:
 
 
 def poor_view(T_wc: NDArray[np.float64], rng: np.random.Generator) -> View:
-    """What a noisy sensor gives of the hall: 5 grey levels, and 3 mm of depth at 1 m, growing with its square."""
+    """What a noisy sensor gives of the hall: 5 grey levels, and 3 mm of depth at 1 m, growing with
+    its square.
+    """
     rgb, depth, _ = render(hall(), T_wc, CAMERA)
-    noisy = np.clip(rgb + 5 * rng.standard_normal(rgb.shape, dtype=np.float32), 0, 255).astype(np.uint8)
+    noisy = np.clip(rgb + 5 * rng.standard_normal(rgb.shape, dtype=np.float32), 0, 255).astype(
+        np.uint8
+    )
     return noisy, depth + 0.003 * depth**2 * rng.standard_normal(depth.shape, dtype=np.float32)

@@ -1,4 +1,6 @@
-"""A cheap world for tests: textured rectangles seen by a pinhole camera, colour and depth exact to the pixel."""
+"""A cheap world for tests: textured rectangles seen by a pinhole camera, colour and depth exact to
+the pixel.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +21,9 @@ CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\n
 
 @dataclass(frozen=True)
 class Rectangle:
-    """origin, across, down: [3] m: a corner and the two edges; texture: [h, w, 3] uint8; moving: what a mask covers."""
+    """origin, across, down: [3] m: a corner and the two edges; texture: [h, w, 3] uint8; moving:
+    what a mask covers.
+    """
 
     origin: NDArray[np.float64]
     across: NDArray[np.float64]
@@ -28,7 +32,9 @@ class Rectangle:
     moving: bool = False
 
 
-def texture(rng: np.random.Generator, height: int, width: int, patches: int = 900) -> NDArray[np.uint8]:
+def texture(
+    rng: np.random.Generator, height: int, width: int, patches: int = 900
+) -> NDArray[np.uint8]:
     """Overlapping patches of random grey and colour: corners everywhere, no two alike."""
     image = np.full((height, width, 3), 120, dtype=np.uint8)
     for _ in range(patches):
@@ -44,17 +50,38 @@ def room(seed: int = 0) -> list[Rectangle]:
     """A wall 2.6 m away, a floor, and a box standing before them."""
     rng = np.random.default_rng(seed)
     return [
-        Rectangle(np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 3.0, 0]), texture(rng, 600, 1200)),
-        Rectangle(np.array([-3.0, 1.0, 0.5]), np.array([6.0, 0, 0]), np.array([0, 0, 2.1]), texture(rng, 420, 1200)),
-        Rectangle(np.array([0.2, -0.1, 1.9]), np.array([0.7, 0, 0.1]), np.array([0, 0.8, 0]), texture(rng, 240, 200)),
+        Rectangle(
+            np.array([-3.0, -2.0, 2.6]),
+            np.array([6.0, 0, 0]),
+            np.array([0, 3.0, 0]),
+            texture(rng, 600, 1200),
+        ),
+        Rectangle(
+            np.array([-3.0, 1.0, 0.5]),
+            np.array([6.0, 0, 0]),
+            np.array([0, 0, 2.1]),
+            texture(rng, 420, 1200),
+        ),
+        Rectangle(
+            np.array([0.2, -0.1, 1.9]),
+            np.array([0.7, 0, 0.1]),
+            np.array([0, 0.8, 0]),
+            texture(rng, 240, 200),
+        ),
     ]
 
 
 def passer_by(step: float, seed: int = 7) -> Rectangle:
-    """A textured board before the camera that goes along with step: the worst kind of mover, full of corners."""
+    """A textured board before the camera that goes along with step: the worst kind of mover, full
+    of corners.
+    """
     left = -1.0 + 0.03 * step
     return Rectangle(
-        np.array([left, -0.7, 1.6]), np.array([0.65, 0, 0]), np.array([0, 1.4, 0]), _board(seed), moving=True
+        np.array([left, -0.7, 1.6]),
+        np.array([0.65, 0, 0]),
+        np.array([0, 1.4, 0]),
+        _board(seed),
+        moving=True,
     )
 
 
@@ -74,17 +101,27 @@ def camera_path(frames: int, later: float = 0.0) -> NDArray[np.float64]:
 def render(
     rectangles: list[Rectangle], T_wc: NDArray[np.float64], camera: Camera = CAMERA
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-    """Colour [H, W, 3], depth [H, W] m (0 where nothing is hit), and where moving things are seen [H, W]."""
+    """Colour [H, W, 3], depth [H, W] m (0 where nothing is hit), and where moving things are seen
+    [H, W].
+    """
     T_cw = np.linalg.inv(T_wc)
     rgb = np.full((camera.height, camera.width, 3), 90, dtype=np.uint8)
     nearest = np.full((camera.height, camera.width), np.inf)
     moving = np.zeros((camera.height, camera.width), dtype=np.bool_)
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
+    )
     for item in rectangles:
         origin = T_cw[:3, :3] @ item.origin + T_cw[:3, 3]
         across, down = T_cw[:3, :3] @ item.across, T_cw[:3, :3] @ item.down
-        if max(keypoint[2] for keypoint in (origin, origin + across, origin + down, origin + across + down)) <= 0.1:
+        if (
+            max(
+                keypoint[2]
+                for keypoint in (origin, origin + across, origin + down, origin + across + down)
+            )
+            <= 0.1
+        ):
             continue
         normal = np.cross(across, down)
         depth = (normal @ origin) / (rays @ normal)
@@ -93,19 +130,27 @@ def render(
         height, width = item.texture.shape[:2]
         map_u, map_v = (a * width - 0.5).astype(np.float32), (b * height - 0.5).astype(np.float32)
         seen = (a >= 0) & (a < 1) & (b >= 0) & (b < 1) & (depth > 0.1) & (depth < nearest)
-        sampled = cv2.remap(item.texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        sampled = cv2.remap(
+            item.texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         rgb[seen], nearest[seen], moving[seen] = sampled[seen], depth[seen], item.moving
     return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
 
 
 def features_at(pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> Features:
-    """Corners of the finest level at pixels [n, 2] px, free of distortion, and depths [n] m, that look like nothing."""
+    """Corners of the finest level at pixels [n, 2] px, free of distortion, and depths [n] m, that
+    look like nothing.
+    """
     none = np.zeros(len(pixels), dtype=np.int64)
-    return Features(pixels, pixels, none, np.zeros((len(pixels), 4), dtype=np.uint64), depths, none > 0)
+    return Features(
+        pixels, pixels, none, np.zeros((len(pixels), 4), dtype=np.uint64), depths, none > 0
+    )
 
 
 def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> Path:
-    """A TUM folder of the room with masks/, camera.yaml and groundtruth.txt; 30 frames/s, depth 5 ms after colour."""
+    """A TUM folder of the room with masks/, camera.yaml and groundtruth.txt; 30 frames/s, depth 5
+    ms after colour.
+    """
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir(parents=True)
     rows: dict[str, list[str]] = {"rgb": [], "depth": []}
@@ -116,7 +161,9 @@ def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> P
         depth = render([*room(), *(then for _, then in boards)], late)[1]
         stamp, later = f"{100 + index / 30:.6f}", f"{100.005 + index / 30:.6f}"
         cv2.imwrite(str(folder / "rgb" / f"{stamp}.png"), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        cv2.imwrite(str(folder / "depth" / f"{later}.png"), (depth * 5000).round().astype(np.uint16))
+        cv2.imwrite(
+            str(folder / "depth" / f"{later}.png"), (depth * 5000).round().astype(np.uint16)
+        )
         cv2.imwrite(str(folder / "masks" / f"{stamp}.png"), moving.astype(np.uint8) * 255)
         rows["rgb"].append(f"{stamp} rgb/{stamp}.png")
         rows["depth"].append(f"{later} depth/{later}.png")

@@ -39,7 +39,15 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def masked(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder a run with masks leaves, run by the command line."""
     out = tmp_path_factory.mktemp("out") / "run"
-    arguments = ["slam", "--sequence", str(sequence), "--out", str(out), "--masks", str(sequence / "masks")]
+    arguments = [
+        "slam",
+        "--sequence",
+        str(sequence),
+        "--out",
+        str(out),
+        "--masks",
+        str(sequence / "masks"),
+    ]
     assert main([*arguments, "--features", "500", "--seed", "1", "--culling.dilate", "7"]) == 0
     return out
 
@@ -72,7 +80,13 @@ def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequenc
     assert rows[0]["keyframe"] == "1"
     assert all(0.2 < float(row["culled_share"]) < 0.6 for row in rows)
     config = yaml.safe_load((masked / "config.yaml").read_text())
-    assert config["culling"] == {"dynamic_classes": None, "score": 0.5, "quality": 0.0, "dilate": 7, "doubt": None}
+    assert config["culling"] == {
+        "dynamic_classes": None,
+        "score": 0.5,
+        "quality": 0.0,
+        "dilate": 7,
+        "doubt": None,
+    }
     assert config["camera"]["fx"] == 260
     assert config["seed"] == 1
 
@@ -92,7 +106,12 @@ def test_without_masks_or_geometry_the_passer_by_spoils_it(
     tmp_path: Path,
 ) -> None:
     good = json.loads((masked / "metrics.json").read_text())["ate_m"]["rmse"]
-    metrics = slam(sequence=sequence, out=tmp_path, features=500, method=Method(geometry=False, static_weights=False))
+    metrics = slam(
+        sequence=sequence,
+        out=tmp_path,
+        features=500,
+        method=Method(geometry=False, static_weights=False),
+    )
     assert metrics["ate_m"]["rmse"] > 5 * good
     assert metrics["ms"]["segment"]["p95"] == 0
     assert len(list((tmp_path / "pictures").iterdir())) == 6
@@ -144,12 +163,32 @@ def test_second_run_replaces_its_files_removes_stale_ones_and_keeps_the_rest(
         (lambda root: (root / "rgb.txt").unlink(), "rgb.txt: cannot be read"),
         (lambda root: (root / "depth.txt").write_text("1.0\n"), "depth.txt:1: expected"),
         (lambda root: (root / "camera.yaml").unlink(), "cannot tell the camera"),
-        (lambda root: (root / "camera.yaml").write_text("fx: 1\n fy: 2\n"), "camera.yaml:2: broken yaml"),
-        (lambda root: (root / "camera.yaml").write_text(CAMERA_YAML.replace("320", "640")), "the camera says 640x240"),
-        (lambda root: next((root / "masks").iterdir()).unlink(), "masks/100.000000.png: cannot be read"),
-        (lambda root: (root / "groundtruth.txt").write_text("1 2 3\n"), "groundtruth.txt:1: 3 numbers"),
+        (
+            lambda root: (root / "camera.yaml").write_text("fx: 1\n fy: 2\n"),
+            "camera.yaml:2: broken yaml",
+        ),
+        (
+            lambda root: (root / "camera.yaml").write_text(CAMERA_YAML.replace("320", "640")),
+            "the camera says 640x240",
+        ),
+        (
+            lambda root: next((root / "masks").iterdir()).unlink(),
+            "masks/100.000000.png: cannot be read",
+        ),
+        (
+            lambda root: (root / "groundtruth.txt").write_text("1 2 3\n"),
+            "groundtruth.txt:1: 3 numbers",
+        ),
     ],
-    ids=["no list", "broken list", "no camera", "broken camera", "wrong size", "mask missing", "broken truth"],
+    ids=[
+        "no list",
+        "broken list",
+        "no camera",
+        "broken camera",
+        "wrong size",
+        "mask missing",
+        "broken truth",
+    ],
 )
 def test_a_users_error_is_one_line_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: object, said: str
@@ -157,7 +196,15 @@ def test_a_users_error_is_one_line_and_leaves_nothing(
     root = write_sequence(tmp_path / "room", 1)
     assert callable(change)
     change(root)
-    arguments = ["slam", "--sequence", str(root), "--out", str(tmp_path / "out"), "--masks", str(root / "masks")]
+    arguments = [
+        "slam",
+        "--sequence",
+        str(root),
+        "--out",
+        str(tmp_path / "out"),
+        "--masks",
+        str(root / "masks"),
+    ]
     assert main(arguments) == 1
     error = capsys.readouterr().err
     assert said in error
@@ -197,7 +244,9 @@ def test_a_truth_of_another_time_costs_the_scores_not_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = write_sequence(tmp_path / "room", 4)
-    (root / "groundtruth.txt").write_text("7.0 0 0 0 0 0 0 1\n7.1 0 0 0 0 0 0 1\n7.2 0 0 0 0 0 0 1\n")
+    (root / "groundtruth.txt").write_text(
+        "7.0 0 0 0 0 0 0 1\n7.1 0 0 0 0 0 0 1\n7.2 0 0 0 0 0 0 1\n"
+    )
     metrics = slam(sequence=root, out=tmp_path / "out", features=200)
     assert metrics["tracked"] == 4
     assert "ate_m" not in metrics
@@ -219,11 +268,25 @@ class TwoClasses:
         box = np.array([[0, 0, width / 2, height]], dtype=np.float32)
         one = np.ones(1, dtype=np.float32)
         mask = np.ones((1, 28, 28), dtype=np.float32)
-        return Detections(box, np.zeros(1, dtype=np.int64), one, self.quality, mask, (height, width), self.class_names)
+        return Detections(
+            box,
+            np.zeros(1, dtype=np.int64),
+            one,
+            self.quality,
+            mask,
+            (height, width),
+            self.class_names,
+        )
 
 
 def test_a_model_masks_the_classes_that_are_asked_for() -> None:
-    view = View(0.0, "0", "0", np.zeros((240, 320, 3), dtype=np.uint8), np.zeros((240, 320), dtype=np.float32))
+    view = View(
+        0.0,
+        "0",
+        "0",
+        np.zeros((240, 320, 3), dtype=np.uint8),
+        np.zeros((240, 320), dtype=np.float32),
+    )
     model = TwoClasses()
     assert SegmenterMasks(model, Culling(dilate=0))(view).mean() == 0.5  # type: ignore[arg-type]
     chairs = SegmenterMasks(model, Culling(dynamic_classes=["chair"]))  # type: ignore[arg-type]
@@ -233,12 +296,19 @@ def test_a_model_masks_the_classes_that_are_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cut_by_quality", "doubt", "px"), [(False, None, 20), (True, None, 10), (True, 1.0, 20), (False, 0.0, 10)]
+    ("cut_by_quality", "doubt", "px"),
+    [(False, None, 20), (True, None, 10), (True, 1.0, 20), (False, 0.0, 10)],
 )
 def test_a_doubtful_contour_grows_more_unless_its_cut_has_seen_to_that(
     cut_by_quality: bool, doubt: float | None, px: int
 ) -> None:
-    view = View(0.0, "0", "0", np.zeros((240, 320, 3), dtype=np.uint8), np.zeros((240, 320), dtype=np.float32))
+    view = View(
+        0.0,
+        "0",
+        "0",
+        np.zeros((240, 320, 3), dtype=np.uint8),
+        np.zeros((240, 320), dtype=np.float32),
+    )
     masks = SegmenterMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
     assert masks(view)[120].sum() == 160 + px
     assert masks.outline(view)[1] == px
@@ -253,11 +323,15 @@ def test_linear_algebra_has_one_thread_while_it_runs(sequence: Path, tmp_path: P
     seen = set()
     with threadpool_limits(2, "blas"):
         source = Recorded(sequence, choose_camera(sequence, None)[0])
-        run_source(source, out=tmp_path / "out", features=300, on_pose=lambda pose: seen.update(threads()))
+        run_source(
+            source, out=tmp_path / "out", features=300, on_pose=lambda pose: seen.update(threads())
+        )
         assert seen == {1}
         assert threads() == {2}, "they are given back"
 
 
 def test_torch_is_never_imported() -> None:
-    code = "import sys, cohdc_train.slam.run, cohdc_train.segmenter; sys.exit('torch' in sys.modules)"
+    code = (
+        "import sys, cohdc_train.slam.run, cohdc_train.segmenter; sys.exit('torch' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

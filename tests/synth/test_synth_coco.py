@@ -1,4 +1,6 @@
-"""The COCO-format set: readable by pycocotools, exact, reproducible, with splits that share nothing."""
+"""The COCO-format set: readable by pycocotools, exact, reproducible, with splits that share
+nothing.
+"""
 
 import hashlib
 import json
@@ -35,7 +37,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_layout_and_loading(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert {p.name for p in folder.iterdir()} == {"images", "instances_train.json", "instances_val.json"}
+    assert {p.name for p in folder.iterdir()} == {
+        "images",
+        "instances_train.json",
+        "instances_val.json",
+    }
     assert len(list((folder / "images").iterdir())) == 13
     people = 0
     for split, number in (("train", 10), ("val", 3)):
@@ -98,7 +104,9 @@ def test_people_who_are_near_fill_more_of_the_picture(folder: Path, tmp_path: Pa
     shares = []
     for root in (folder, tmp_path / "near"):
         annotations = json.loads((root / "instances_train.json").read_text())["annotations"]
-        shares.append(sum(annotation["area"] for annotation in annotations) / (10 * SIZE[0] * SIZE[1]))
+        shares.append(
+            sum(annotation["area"] for annotation in annotations) / (10 * SIZE[0] * SIZE[1])
+        )
     assert shares[1] > 1.5 * shares[0], shares
 
 
@@ -108,7 +116,10 @@ def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
     for i, a in enumerate(stages):
         for b in stages[:i]:
             assert a.room.size != b.room.size
-            walls = [np.array_equal(x, y) for x, y in zip(a.room.textures[:6], b.room.textures[:6], strict=True)]
+            walls = [
+                np.array_equal(x, y)
+                for x, y in zip(a.room.textures[:6], b.room.textures[:6], strict=True)
+            ]
             assert not any(walls)
             for p in a.people:
                 for q in b.people:
@@ -128,7 +139,9 @@ def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
         ({"distance": (0.5, float("inf"))}, "distance: 0.5 to inf m"),
     ],
 )
-def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
+def test_bad_arguments_in_one_line(
+    tmp_path: Path, arguments: dict[str, object], message: str
+) -> None:
     with pytest.raises(DataError, match=message) as caught:
         coco(tmp_path / "set", **arguments)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)

@@ -1,4 +1,6 @@
-"""Camera paths and walks: smooth, within their reach, out of sight when they jump, at rest when they should be."""
+"""Camera paths and walks: smooth, within their reach, out of sight when they jump, at rest when
+they should be.
+"""
 
 import numpy as np
 import pytest
@@ -16,19 +18,27 @@ def test_camera_moves_smoothly_about_the_eye(motion: str) -> None:
     eye = np.array([0.1, 0.9, 1.4])
     poses = camera_path(np.random.default_rng(1), TIMES, motion, eye)  # type: ignore[arg-type]
     rotations, offsets = poses[:, :3, :3], poses[:, :3, 3] - eye
-    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (300, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (300, 1, 1)), atol=1e-9
+    )
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-9)
     np.testing.assert_array_equal(poses[:, 3], np.tile([0, 0, 0, 1], (300, 1)))
     speed = np.linalg.norm(np.diff(offsets, axis=0), axis=1) * 30
-    turn = np.arccos(np.clip((np.einsum("nij,nij->n", rotations[1:], rotations[:-1]) - 1) / 2, -1, 1)) * 30
+    turn = (
+        np.arccos(np.clip((np.einsum("nij,nij->n", rotations[1:], rotations[:-1]) - 1) / 2, -1, 1))
+        * 30
+    )
     spread = offsets.max(axis=0) - offsets.min(axis=0)
     assert speed.max() < 0.9
     assert np.degrees(turn).max() < 60
     assert rotations[:, 1, 2].min() > 0.5, "looks along +y"
     assert rotations[:, 2, 1].max() < -0.5, "upright"
-    lowest, highest = {"xyz": (0.4, 0.62), "halfsphere": (0.3, 1.1), "static": (0.001, 0.02), "rpy": (0.01, 0.06)}[
-        motion
-    ]
+    lowest, highest = {
+        "xyz": (0.4, 0.62),
+        "halfsphere": (0.3, 1.1),
+        "static": (0.001, 0.02),
+        "rpy": (0.01, 0.06),
+    }[motion]
     assert lowest < spread.max() < highest
 
 
@@ -54,7 +64,11 @@ def test_a_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: i
         ahead = np.stack([np.cos(way.heading[1:]), np.sin(way.heading[1:])], 1)
         forward = np.einsum("ni,ni->n", ahead, velocity) > 0
         assert forward[walking].mean() > 0.98, "all but the first step after a turn out of sight"
-    apart = [np.linalg.norm(a.position - b.position, axis=1).min() for i, a in enumerate(ways) for b in ways[:i]]
+    apart = [
+        np.linalg.norm(a.position - b.position, axis=1).min()
+        for i, a in enumerate(ways)
+        for b in ways[:i]
+    ]
     assert all(gap > 0.15 for gap in apart)
 
 
@@ -77,7 +91,9 @@ def test_a_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
         assert (rotations[:, :, 2] @ ahead).max() > 0.95, "every wall is looked at"
     assert np.linalg.norm(places[200] - places[0]) > 1, "it walks, too"
     assert (np.linalg.norm(np.diff(places, axis=0), axis=1) * 30).max() < 0.8
-    assert max(angle(a, b) for a, b in zip(rotations[:-1:9], rotations[1::9], strict=False)) * 30 < 80
+    assert (
+        max(angle(a, b) for a, b in zip(rotations[:-1:9], rotations[1::9], strict=False)) * 30 < 80
+    )
     back = np.linalg.norm(places - places[-1], axis=1) < 0.15
     assert back[-40:].all(), "time enough to notice"
 
@@ -89,15 +105,21 @@ def test_a_crowd_led_round_stays_as_far_from_the_camera_as_it_was(seed: int, peo
     eyes = camera_path(rng, TIMES, "loop", np.zeros(3))[:, :2, 3]
     ways = crowd(rng, TIMES, 1.2 + 0.35 * np.arange(people), 0.75)
     for before, after in zip(ways, led_round(ways, TIMES, eyes, loop_heading(TIMES)), strict=True):
-        np.testing.assert_allclose(np.linalg.norm(after.position - eyes, axis=1), before.position[:, 1])
-        assert np.linalg.norm(after.position, axis=1).max() < 0.7 + 0.3 + before.position[:, 1].max()
+        np.testing.assert_allclose(
+            np.linalg.norm(after.position - eyes, axis=1), before.position[:, 1]
+        )
+        assert (
+            np.linalg.norm(after.position, axis=1).max() < 0.7 + 0.3 + before.position[:, 1].max()
+        )
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), people=st.integers(1, 4))
 def test_people_stop_for_seconds_in_the_view_and_walk_on(seed: int, people: int) -> None:
     distances = 1.2 + 0.35 * np.arange(people)
-    for way, distance in zip(stop_and_go(np.random.default_rng(seed), TIMES, distances), distances, strict=True):
+    for way, distance in zip(
+        stop_and_go(np.random.default_rng(seed), TIMES, distances), distances, strict=True
+    ):
         velocity = np.diff(way.position, axis=0) * 30
         speed = np.linalg.norm(velocity, axis=1)
         stands = np.split(speed == 0, np.flatnonzero(np.diff(speed == 0)) + 1)
@@ -106,7 +128,9 @@ def test_people_stop_for_seconds_in_the_view_and_walk_on(seed: int, people: int)
         assert speed.max() > 0.5
         assert speed.max() < 1
         assert np.all(way.pace[1:][speed == 0] == 0)
-        assert np.all(np.abs(way.position[:, 0]) < 0.5 * distance), "never out of sight of a still camera"
+        assert np.all(np.abs(way.position[:, 0]) < 0.5 * distance), (
+            "never out of sight of a still camera"
+        )
         ahead = np.stack([np.cos(way.heading[1:]), np.sin(way.heading[1:])], 1)
         fast = speed > 0.4
         assert np.einsum("ni,ni->n", ahead, velocity)[fast].min() > 0.3, "they look where they walk"
@@ -125,7 +149,9 @@ def test_a_cart_rolls_to_and_fro_and_its_pusher_stays_behind_it(seed: int) -> No
     assert line.min() >= -1.2
     ahead = np.array([np.cos(cart.heading[0]), np.sin(cart.heading[0])])
     np.testing.assert_allclose(cart.position - pusher.position, np.tile(ahead, (300, 1)), atol=1e-9)
-    np.testing.assert_allclose(np.diff(pusher.travelled), np.diff(cart.position, axis=0) @ ahead, atol=1e-9)
+    np.testing.assert_allclose(
+        np.diff(pusher.travelled), np.diff(cart.position, axis=0) @ ahead, atol=1e-9
+    )
 
 
 def test_who_comes_up_to_the_camera_stays_before_it_wherever_it_moves() -> None:

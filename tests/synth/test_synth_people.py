@@ -23,7 +23,9 @@ def test_any_body_in_any_pose_stands_on_the_floor(seed: int) -> None:
     z = mesh.corners[..., 2]
     assert np.isfinite(mesh.corners).all()
     assert z.min() == pytest.approx(0, abs=0.012 * someone.height)
-    assert 0.85 * someone.height < z.max() < 1.35 * someone.height  # above the head only with a raised hand
+    assert (
+        0.85 * someone.height < z.max() < 1.35 * someone.height
+    )  # above the head only with a raised hand
     middle = mesh.corners.reshape(-1, 3)[:, :2].mean(axis=0)
     assert np.hypot(*(middle - (1.0, -2.0))) < 0.5
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-3)
@@ -49,7 +51,9 @@ def test_normals_point_out_of_the_body(person: Person) -> None:
 
 def test_walk_is_a_cycle_whose_halves_mirror(person: Person) -> None:
     here = person_mesh(person, walking(0.4), (0, 0), 0).corners
-    np.testing.assert_allclose(here, person_mesh(person, walking(0.4 + 2 * np.pi), (0, 0), 0).corners, atol=1e-5)
+    np.testing.assert_allclose(
+        here, person_mesh(person, walking(0.4 + 2 * np.pi), (0, 0), 0).corners, atol=1e-5
+    )
     other = person_mesh(person, walking(0.4 + np.pi), (0, 0), 0).corners
     assert np.abs(here - other).max() > 0.3
     # mirrored left to right, the half cycle later has the same extent
@@ -66,9 +70,12 @@ def test_heading_turns_the_body(person: Person) -> None:
 
 def test_streams_share_no_people() -> None:
     drawn = [
-        draw_person(stream(0, *key)) for key in (("coco-train", 0), ("coco-val", 0), ("sequence", 0), ("coco-train", 1))
+        draw_person(stream(0, *key))
+        for key in (("coco-train", 0), ("coco-val", 0), ("sequence", 0), ("coco-train", 1))
     ]
     for i, a in enumerate(drawn):
         for b in drawn[:i]:
             assert a.height != b.height
-            assert all(not np.array_equal(x, y) for x, y in zip(a.textures, b.textures, strict=True))
+            assert all(
+                not np.array_equal(x, y) for x, y in zip(a.textures, b.textures, strict=True)
+            )

@@ -38,7 +38,9 @@ def test_depth_of_a_plane(
     hits = cast(plane, CAMERA, pose)
     d = rays(CAMERA).astype(float)
     x, y, z = position
-    expected = (distance + slope_x * x + slope_y * y - z) / (1 - slope_x * d[:, 0] - slope_y * d[:, 1])
+    expected = (distance + slope_x * x + slope_y * y - z) / (
+        1 - slope_x * d[:, 0] - slope_y * d[:, 1]
+    )
     inside = (expected > 0) & (expected < 30)
     assert inside.any()
     np.testing.assert_allclose(hits.depth[inside], expected[inside], rtol=2e-4)
@@ -50,7 +52,9 @@ def test_ball_covers_its_circle_and_owns_its_pixels() -> None:
     found = render(ball, Atlas([GREY] * 8), LIGHT, camera, looking_at_z()).instance
     assert set(np.unique(found)) == {0, 7}
     radius = 200 * 0.5 / np.sqrt(3**2 - 0.5**2)
-    assert 0.9 < (found == 7).sum() / (np.pi * radius**2) < 1.0, "the mesh is inscribed in the sphere"
+    assert 0.9 < (found == 7).sum() / (np.pi * radius**2) < 1.0, (
+        "the mesh is inscribed in the sphere"
+    )
 
 
 def test_nearest_instance_wins_and_nothing_is_zero() -> None:
@@ -79,24 +83,34 @@ def test_texture_is_laid_on_upright_at_every_distance() -> None:
         right, left = int(CAMERA.cx + u), int(CAMERA.cx - u)
         top, bottom = int(CAMERA.cy - v), int(CAMERA.cy + v)
         ambient = 0.82 - 0.18  # the wall looks down the z axis
-        np.testing.assert_allclose(view.rgb[top, right], np.array([200, 0, 0]) / 255 * ambient, atol=0.02)
-        np.testing.assert_allclose(view.rgb[bottom, left], np.array([0, 0, 200]) / 255 * ambient, atol=0.02)
+        np.testing.assert_allclose(
+            view.rgb[top, right], np.array([200, 0, 0]) / 255 * ambient, atol=0.02
+        )
+        np.testing.assert_allclose(
+            view.rgb[bottom, left], np.array([0, 0, 200]) / 255 * ambient, atol=0.02
+        )
         np.testing.assert_allclose(view.rgb[top, left], 0, atol=0.02)
 
 
 def test_lamp_lights_by_cosine_and_distance() -> None:
-    lamp = Lighting(np.array([[0, 0, 1.0]], np.float32), np.ones((1, 3), np.float32), np.zeros(3, np.float32))
+    lamp = Lighting(
+        np.array([[0, 0, 1.0]], np.float32), np.ones((1, 3), np.float32), np.zeros(3, np.float32)
+    )
     wall = solids.quad((-4, -4, 2), (8, 0, 0), (0, 8, 0), 0)
     view = render(wall, Atlas([GREY]), lamp, Camera(50, 50, 40, 30, 80, 60), looking_at_z())
     middle = 128 / 255 / (1 + 0.12)
     np.testing.assert_allclose(view.rgb[30, 40], middle, rtol=0.01)
-    aside = 128 / 255 * np.sqrt(0.5) / (1 + 0.12 * 2)  # 25 px to the right: 1 m aside, at 45 degrees
+    aside = (
+        128 / 255 * np.sqrt(0.5) / (1 + 0.12 * 2)
+    )  # 25 px to the right: 1 m aside, at 45 degrees
     np.testing.assert_allclose(view.rgb[30, 65], aside, rtol=0.01)
 
 
 def test_resized_camera_sees_the_same_view() -> None:
     camera = Camera.freiburg3((480, 640))
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((535.4, 539.2, 320.1, 247.6))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(
+        (535.4, 539.2, 320.1, 247.6)
+    )
     double = camera.resized(2)
     coarse = rays(camera).reshape(480, 640, 3)
     fine = rays(double).reshape(480, 2, 640, 2, 3).mean(axis=(1, 3))

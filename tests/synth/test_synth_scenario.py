@@ -1,4 +1,6 @@
-"""What a scene promises: who is seen how much, what moves and what does not, and the same bytes for the same seed."""
+"""What a scene promises: who is seen how much, what moves and what does not, and the same bytes for
+the same seed.
+"""
 
 import hashlib
 import itertools
@@ -34,7 +36,9 @@ def views(scene: Scene, step: int) -> list[View]:
 
 def people_in(scene: Scene, view: View) -> float:
     """Share of the pixels on people."""
-    return float(np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance].mean())
+    return float(
+        np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance].mean()
+    )
 
 
 @pytest.mark.parametrize(
@@ -74,7 +78,12 @@ def test_a_cart_alone_is_a_mover_but_nobody(tmp_path: Path) -> None:
     sequence(tmp_path / "s", frames=90, size=SIZE, seed=7, people=0, scene=Setting(cart="alone"))
 
     def shares(folder: str) -> np.ndarray:
-        return np.array([(cv2.imread(str(p), 0) == 255).mean() for p in sorted((tmp_path / "s" / folder).iterdir())])
+        return np.array(
+            [
+                (cv2.imread(str(p), 0) == 255).mean()
+                for p in sorted((tmp_path / "s" / folder).iterdir())
+            ]
+        )
 
     moving = shares("movers")
     assert np.all(shares("masks") == 0)
@@ -100,7 +109,9 @@ def test_a_cart_is_pushed_across_the_view_and_changes_the_depth_there() -> None:
     changed = np.mean([np.abs(a.depth - b.depth) > 0.2 for a, b in itertools.pairwise(seen)])
     assert changed > 0.2, "a camera that hardly moves sees other depths"
     hands = pusher.mesh(60).corners.reshape(-1, 3)
-    assert np.linalg.norm(hands - places[6], axis=1).min() < 0.9, "the pusher's hands reach the cart"
+    assert np.linalg.norm(hands - places[6], axis=1).min() < 0.9, (
+        "the pusher's hands reach the cart"
+    )
 
 
 def test_who_stops_does_not_move_at_all_and_then_goes() -> None:
@@ -148,7 +159,9 @@ def test_a_loop_sees_furniture_in_every_direction_and_its_first_view_again(loop:
         return render(loop.room.mesh, atlas, loop.room.lighting, camera, loop.poses[k])
 
     first, half, last = (picture(k) for k in (0, 140, 299))
-    other_way, again = (float(np.median(np.abs(first.depth - later.depth))) for later in (half, last))
+    other_way, again = (
+        float(np.median(np.abs(first.depth - later.depth))) for later in (half, last)
+    )
     assert again < 0.1
     assert other_way > 0.25
     for view in map(picture, range(0, 300, 40)):
@@ -179,7 +192,10 @@ def test_same_seed_same_bytes(tmp_path: Path, options: dict[str, object]) -> Non
     def digests(name: str, seed: int) -> dict[str, str]:
         sequence(tmp_path / name, frames=2, size=SIZE, seed=seed, **options)  # type: ignore[arg-type]
         files = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
-        return {str(p.relative_to(tmp_path / name)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+        return {
+            str(p.relative_to(tmp_path / name)): hashlib.sha256(p.read_bytes()).hexdigest()
+            for p in files
+        }
 
     first, again, other = digests("a", 7), digests("b", 7), digests("c", 11)
     assert first == again
@@ -189,8 +205,14 @@ def test_same_seed_same_bytes(tmp_path: Path, options: dict[str, object]) -> Non
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"scene": Setting(action="dance")}, "scene.action: 'dance' is none of walk, stop_and_go, fill_view, sit"),  # type: ignore[arg-type]
-        ({"scene": Setting(cart="pushed"), "people": 0}, "scene.cart: pushed, but there are 0 people"),
+        (
+            {"scene": Setting(action="dance")},
+            "scene.action: 'dance' is none of walk, stop_and_go, fill_view, sit",
+        ),  # type: ignore[arg-type]
+        (
+            {"scene": Setting(cart="pushed"), "people": 0},
+            "scene.cart: pushed, but there are 0 people",
+        ),
         ({"scene": Setting(walls="plain"), "motion": "loop"}, "motion: a loop goes with"),
         ({"people": 13}, "people: 13 is not in 0..12"),
     ],

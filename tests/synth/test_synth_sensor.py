@@ -4,13 +4,25 @@ import numpy as np
 import pytest
 
 from cohdc_train.synth.renderer import View
-from cohdc_train.synth.sensor import DEPTH_SCALE, depth_edges, exposure, measure_depth, photograph, smear
+from cohdc_train.synth.sensor import (
+    DEPTH_SCALE,
+    depth_edges,
+    exposure,
+    measure_depth,
+    photograph,
+    smear,
+)
 
 
 def flat_view(depth: np.ndarray, facing: float = 1.0) -> View:
     shape = depth.shape
     grey = np.full((*shape, 3), 0.5, np.float32)
-    return View(grey, depth.astype(np.float32), np.zeros(shape, np.int32), np.full(shape, facing, np.float32))
+    return View(
+        grey,
+        depth.astype(np.float32),
+        np.zeros(shape, np.int32),
+        np.full(shape, facing, np.float32),
+    )
 
 
 @pytest.mark.parametrize("distance", [0.8, 2.0, 4.0])
@@ -37,7 +49,9 @@ def test_edges_and_grazing_surfaces_lose_readings() -> None:
     units = measure_depth(flat_view(depth), np.random.default_rng(1))
     assert (units[edges] == 0).mean() == pytest.approx(0.6, abs=0.08)
     assert (units[~edges] == 0).mean() < 0.04
-    grazing = measure_depth(flat_view(np.full((100, 100), 2.0), facing=0.12), np.random.default_rng(1))
+    grazing = measure_depth(
+        flat_view(np.full((100, 100), 2.0), facing=0.12), np.random.default_rng(1)
+    )
     assert (grazing == 0).mean() == pytest.approx(0.8, abs=0.05)
 
 

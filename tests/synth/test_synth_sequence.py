@@ -38,9 +38,24 @@ def rows(path: Path) -> list[list[str]]:
 def test_layout(folder: Path) -> None:
     names = {p.name for p in folder.iterdir()}
     assert names == {
-        *("rgb", "depth", "masks", "movers", "rgb.txt", "depth.txt", "groundtruth.txt", "camera.yaml", "info.json"),
+        *(
+            "rgb",
+            "depth",
+            "masks",
+            "movers",
+            "rgb.txt",
+            "depth.txt",
+            "groundtruth.txt",
+            "camera.yaml",
+            "info.json",
+        ),
     }
-    for kind, dtype in (("rgb", np.uint8), ("depth", np.uint16), ("masks", np.uint8), ("movers", np.uint8)):
+    for kind, dtype in (
+        ("rgb", np.uint8),
+        ("depth", np.uint16),
+        ("masks", np.uint8),
+        ("movers", np.uint8),
+    ):
         files = sorted((folder / kind).iterdir())
         assert len(files) == FRAMES
         image = cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED)
@@ -53,7 +68,9 @@ def test_layout(folder: Path) -> None:
         assert text[2] == "# timestamp filename"
         listed = rows(folder / f"{kind}.txt")
         assert len(listed) == FRAMES
-        assert all(name == f"{kind}/{stamp}.png" and (folder / name).is_file() for stamp, name in listed)
+        assert all(
+            name == f"{kind}/{stamp}.png" and (folder / name).is_file() for stamp, name in listed
+        )
         stamps = np.array([float(stamp) for stamp, _ in listed])
         np.testing.assert_allclose(np.diff(stamps), 1 / 30, atol=2e-6)
     assert listed[0][0] == "1305031102.175304"
@@ -104,7 +121,10 @@ def test_written_truth_carries_depth_from_frame_to_frame(folder: Path) -> None:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(truth[3 * k, 4:]).as_matrix()
         pose[:3, 3] = truth[3 * k, 1:4]
-        depth = cv2.imread(str(folder / "depth" / f"{stamps[k]}.png"), cv2.IMREAD_UNCHANGED) / camera["depth_scale"]
+        depth = (
+            cv2.imread(str(folder / "depth" / f"{stamps[k]}.png"), cv2.IMREAD_UNCHANGED)
+            / camera["depth_scale"]
+        )
         return pose, depth, cv2.imread(str(folder / "masks" / f"{stamps[k]}.png"), 0) == 0
 
     (first_pose, first, first_static), (last_pose, last, last_static) = frame(0), frame(FRAMES - 1)
@@ -120,7 +140,9 @@ def test_written_truth_carries_depth_from_frame_to_frame(folder: Path) -> None:
     error = (np.abs(last[y, x] - z) / sigma)[seen]
     assert seen.sum() > 3000
     assert np.linalg.norm(first_pose[:3, 3] - last_pose[:3, 3]) > 0.02
-    assert np.median(error) == pytest.approx(0.674, abs=0.15), "a normal distribution of the sensor's sigma"
+    assert np.median(error) == pytest.approx(0.674, abs=0.15), (
+        "a normal distribution of the sensor's sigma"
+    )
     assert (error < 3.5).mean() > 0.9
 
 
@@ -130,7 +152,12 @@ def test_wall_depth_is_the_rooms_geometry() -> None:
     view = render(scene.room.mesh, scene.atlas(), scene.room.lighting, scene.camera, pose)
     v, u = np.mgrid[: SIZE[0], : SIZE[1]]
     rays = np.stack(
-        [(u - scene.camera.cx) / scene.camera.fx, (v - scene.camera.cy) / scene.camera.fy, np.ones_like(u)], -1
+        [
+            (u - scene.camera.cx) / scene.camera.fx,
+            (v - scene.camera.cy) / scene.camera.fy,
+            np.ones_like(u),
+        ],
+        -1,
     )
     world = (rays @ pose[:3, :3].T) * view.depth[..., None] + pose[:3, 3]
     width, length, height = scene.room.size
@@ -157,7 +184,10 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
     def digests(name: str, seed: int) -> dict[str, str]:
         sequence(tmp_path / name, frames=3, size=(48, 64), seed=seed, people=1)
         files = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
-        return {str(p.relative_to(tmp_path / name)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+        return {
+            str(p.relative_to(tmp_path / name)): hashlib.sha256(p.read_bytes()).hexdigest()
+            for p in files
+        }
 
     first, again, other = digests("a", 0), digests("b", 0), digests("c", 1)
     assert first == again
@@ -174,7 +204,9 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
         ({"people": 13}, "people: 13"),
     ],
 )
-def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
+def test_bad_arguments_in_one_line(
+    tmp_path: Path, arguments: dict[str, object], message: str
+) -> None:
     with pytest.raises(DataError, match=message) as caught:
         sequence(tmp_path / "s", **arguments)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
@@ -183,4 +215,9 @@ def test_bad_arguments_in_one_line(tmp_path: Path, arguments: dict[str, object],
 
 def test_importing_the_room_is_cheap() -> None:
     code = "import sys, cohdc_train.synth; print([m for m in ('embreex', 'torch', 'scipy') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )

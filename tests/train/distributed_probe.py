@@ -1,4 +1,6 @@
-"""What the tests of distributed training put into `cohdc fit`: a callback that writes down what each rank saw."""
+"""What the tests of distributed training put into `cohdc fit`: a callback that writes down what
+each rank saw.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,8 @@ from cohdc_train.train import module
 class Probe(pl.Callback):
     """Writes `rankN.pt`: the losses of every step, the validation scores and the trained weights.
 
-    Validation is on detections made of the toy images' colours: a network of a few steps would not give any.
+    Validation is on detections made of the toy images' colours: a network of a few steps would not
+    give any.
     apart: a fault on purpose, every rank keeps its own gradients.
     """
 
@@ -29,20 +32,30 @@ class Probe(pl.Callback):
         if self.apart:
             trainer.strategy.model.register_comm_hook(None, _keep_own_gradients)
 
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         self.losses.append(float(outputs["loss"]))
 
     def on_validation_end(self, trainer: Any, pl_module: Any) -> None:
-        self.scores = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+        self.scores = {
+            k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")
+        }
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        seen = {"losses": self.losses, "scores": self.scores, "weights": pl_module.network.state_dict()}
+        seen = {
+            "losses": self.losses,
+            "scores": self.scores,
+            "weights": pl_module.network.state_dict(),
+        }
         torch.save(seen, self.folder / f"rank{trainer.global_rank}.pt")
 
 
 def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
-    """One detection per colour of the toy images, off by an amount that follows from the image's pixels."""
+    """One detection per colour of the toy images, off by an amount that follows from the image's
+    pixels.
+    """
     found = []
     for image in images:
         boxes, labels = [], []
@@ -50,7 +63,9 @@ def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
             inside = (image == torch.tensor(colour)[:, None, None]).all(dim=0)
             rows, columns = inside.any(dim=1).nonzero()[:, 0], inside.any(dim=0).nonzero()[:, 0]
             if len(rows):
-                boxes.append([int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1])
+                boxes.append(
+                    [int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1]
+                )
                 labels.append(label)
         drawn = torch.Generator().manual_seed(int(image.sum()))
         n = len(labels)
@@ -67,7 +82,9 @@ def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
     return found
 
 
-def _keep_own_gradients(state: Any, bucket: torch.distributed.GradBucket) -> torch.futures.Future[Tensor]:
+def _keep_own_gradients(
+    state: Any, bucket: torch.distributed.GradBucket
+) -> torch.futures.Future[Tensor]:
     """A communication hook that does not communicate."""
     kept: torch.futures.Future[Tensor] = torch.futures.Future()
     kept.set_result(bucket.buffer())

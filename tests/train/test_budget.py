@@ -6,16 +6,29 @@ from typing import Any
 import pytest
 import torch
 
-from cohdc_train.train.budget import auto_precision, default_epochs, training_limits, validation_interval
+from cohdc_train.train.budget import (
+    auto_precision,
+    default_epochs,
+    training_limits,
+    validation_interval,
+)
 
 
-def limits(epochs: int | None = None, minutes: float | None = None, **trainer: Any) -> dict[str, Any]:
-    return training_limits({"max_epochs": None, "max_steps": -1, "max_time": None, **trainer}, epochs, minutes)
+def limits(
+    epochs: int | None = None, minutes: float | None = None, **trainer: Any
+) -> dict[str, Any]:
+    return training_limits(
+        {"max_epochs": None, "max_steps": -1, "max_time": None, **trainer}, epochs, minutes
+    )
 
 
 def test_minutes_and_epochs_are_trainer_limits() -> None:
     assert limits() == {"max_epochs": None, "max_steps": -1, "max_time": None}
-    assert limits(minutes=6) == {"max_epochs": -1, "max_steps": -1, "max_time": timedelta(minutes=6)}
+    assert limits(minutes=6) == {
+        "max_epochs": -1,
+        "max_steps": -1,
+        "max_time": timedelta(minutes=6),
+    }
     assert limits(epochs=3)["max_epochs"] == 3
     assert limits(max_steps=50) == {"max_epochs": -1, "max_steps": 50, "max_time": None}
     assert limits(minutes=6, max_epochs=12)["max_epochs"] == 12
@@ -46,11 +59,16 @@ def test_longer_trainings_validate_more_often(minutes: int, count: int) -> None:
 def test_validations_follow_steps_and_epochs() -> None:
     steps = validation_interval({"max_epochs": -1, "max_steps": 400, "max_time": None})
     assert steps == {"val_check_interval": 100, "check_val_every_n_epoch": None}
-    epochs = [validation_interval({"max_epochs": n, "max_steps": -1, "max_time": None}) for n in (1, 12, 300)]
+    epochs = [
+        validation_interval({"max_epochs": n, "max_steps": -1, "max_time": None})
+        for n in (1, 12, 300)
+    ]
     assert [interval["check_val_every_n_epoch"] for interval in epochs] == [1, 3, 75]
 
 
 @pytest.mark.parametrize(("has_bf16", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_precision_follows_the_processor(has_bf16: bool, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precision_follows_the_processor(
+    has_bf16: bool, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has_bf16})
     assert auto_precision("cpu") == expected

@@ -15,7 +15,9 @@ from cohdc_train.models import MaskRCNN, NetworkConfig, detect
 from cohdc_train.models.frozen_norm import FrozenNorm
 from cohdc_train.train.module import MaskRCNNModule
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
 IMAGE = torch.from_numpy(drawn_images(1)[0]).permute(2, 0, 1)
 
 
@@ -40,10 +42,16 @@ def module_of(config: NetworkConfig, names: list[str]) -> MaskRCNNModule:
     return MaskRCNNModule(names, config).eval()
 
 
-@pytest.fixture(scope="module", params=[pytest.param("resnet", marks=pytest.mark.slow), "mobilenet_v2"])
+@pytest.fixture(
+    scope="module", params=[pytest.param("resnet", marks=pytest.mark.slow), "mobilenet_v2"]
+)
 def network(request: pytest.FixtureRequest, opinionated: MaskRCNN) -> MaskRCNN:
     options: dict[str, Any] = {"norm": "frozen", "backbone": request.param, "score_threshold": 0.05}
-    options |= {} if request.param == "resnet" else {"width": 1.0, "rates": ((1,), (1,), (1, 2), (1, 2, 3))}
+    options |= (
+        {}
+        if request.param == "resnet"
+        else {"width": 1.0, "rates": ((1,), (1,), (1, 2), (1, 2, 3))}
+    )
     return trained(dataclasses.replace(opinionated.config, **options))
 
 
@@ -64,13 +72,17 @@ def test_the_network_finds_what_the_file_finds(network: MaskRCNN, file: Path) ->
 
 
 @pytest.mark.slow
-def test_quantised_weights_come_back_within_their_step(network: MaskRCNN, file: Path, tmp_path: Path) -> None:
+def test_quantised_weights_come_back_within_their_step(
+    network: MaskRCNN, file: Path, tmp_path: Path
+) -> None:
     small = tmp_path / "model.int8.onnx"
     quantize(file, small, drawn_images(2))
     exact, rounded = (module_of(network.config, ["person", "car"]) for _ in range(2))
     exact.take_over(file)
     assert rounded.take_over(small) == []
-    for (name, one), other in zip(exact.network.named_parameters(), rounded.network.parameters(), strict=True):
+    for (name, one), other in zip(
+        exact.network.named_parameters(), rounded.network.parameters(), strict=True
+    ):
         step = one.abs().max() / 63  # 7 bits with a sign
         assert (one - other).abs().max() <= 0.51 * step + 1e-6, name
 
@@ -78,16 +90,27 @@ def test_quantised_weights_come_back_within_their_step(network: MaskRCNN, file: 
 def test_other_classes_keep_what_decides_between_them(network: MaskRCNN, file: Path) -> None:
     module = module_of(network.config, ["robot"])
     left = module.take_over(file)
-    assert {name.rsplit(".", 2)[-2] for name in left} == {"cls_score", "bbox_pred", "mask_fcn_logits", "quality"}
+    assert {name.rsplit(".", 2)[-2] for name in left} == {
+        "cls_score",
+        "bbox_pred",
+        "mask_fcn_logits",
+        "quality",
+    }
 
 
-def test_what_does_not_fit_is_told_in_one_line(network: MaskRCNN, file: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_told_in_one_line(
+    network: MaskRCNN, file: Path, tmp_path: Path
+) -> None:
     config = network.config
     (garbage := tmp_path / "garbage.onnx").write_bytes(b"no graph")
     for path, changed, message in (
         (file, {"norm": "batch"}, "is trained, and the file holds none; freeze it"),
         (file, {"cqe": "off"}, r"has \d+ layers, the network \d+"),
-        (file, {"fc": 16}, r"layer roi_heads.box_head.fc6 is \[32, \d+\] in the file, \[16, \d+\] here"),
+        (
+            file,
+            {"fc": 16},
+            r"layer roi_heads.box_head.fc6 is \[32, \d+\] in the file, \[16, \d+\] here",
+        ),
         (garbage, {}, r"garbage\.onnx: not "),
         (tmp_path / "nowhere.onnx", {}, r"nowhere\.onnx: no such file"),
     ):

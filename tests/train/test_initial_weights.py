@@ -33,33 +33,57 @@ def test_nano_and_small_start_from_the_shipped_network(name: str) -> None:
     network = fields(name)
     initial = choose_initial_weights("auto", network)
     assert (initial.kind, initial.source) == ("network", "person")
-    assert resolve_network(initial, network) == {"weights": None, "norm": "frozen", "frozen_stages": 2}
+    assert resolve_network(initial, network) == {
+        "weights": None,
+        "norm": "frozen",
+        "frozen_stages": 2,
+    }
 
 
-@pytest.mark.parametrize("name", ["hdc_net_m", "resnet18_hdc", "resnet50", "resnet50_hdc", "resnet101"])
+@pytest.mark.parametrize(
+    "name", ["hdc_net_m", "resnet18_hdc", "resnet50", "resnet50_hdc", "resnet101"]
+)
 def test_resnets_start_from_published_weights(name: str) -> None:
     network = fields(name)
     initial = choose_initial_weights("auto", network)
     assert (initial.kind, initial.source) == ("backbone", "IMAGENET1K_V1")
-    assert resolve_network(initial, network) == {"weights": "IMAGENET1K_V1", "norm": "frozen", "frozen_stages": 2}
+    assert resolve_network(initial, network) == {
+        "weights": "IMAGENET1K_V1",
+        "norm": "frozen",
+        "frozen_stages": 2,
+    }
 
 
-@pytest.mark.parametrize("changes", [{"fpn_channels": 32}, {"mask_size": 56}, {"cqe": "off"}, {"norm": "batch"}])
-def test_other_layers_than_the_shipped_ones_start_from_published_weights(changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "changes", [{"fpn_channels": 32}, {"mask_size": 56}, {"cqe": "off"}, {"norm": "batch"}]
+)
+def test_other_layers_than_the_shipped_ones_start_from_published_weights(
+    changes: dict[str, Any],
+) -> None:
     assert choose_initial_weights("auto", fields("hdc_net_n", **changes)).source == "IMAGENET1K_V1"
 
 
 @pytest.mark.parametrize(
     ("network", "reason"),
-    [(fields("mobilenet_v1"), "mobilenet_v1"), (fields(width=0.5), "width"), (fields("hdc_net_n", width=0.5), "width")],
+    [
+        (fields("mobilenet_v1"), "mobilenet_v1"),
+        (fields(width=0.5), "width"),
+        (fields("hdc_net_n", width=0.5), "width"),
+    ],
 )
-def test_without_published_weights_training_starts_at_random(network: dict[str, Any], reason: str) -> None:
+def test_without_published_weights_training_starts_at_random(
+    network: dict[str, Any], reason: str
+) -> None:
     initial = choose_initial_weights("auto", network)
     assert initial.kind == "random"
     assert reason in initial.describe(100)
     assert "100 images are few" in initial.describe(100)
     assert "few" not in initial.describe(100_000)
-    assert resolve_network(initial, network) == {"weights": None, "norm": "batch", "frozen_stages": 0}
+    assert resolve_network(initial, network) == {
+        "weights": None,
+        "norm": "batch",
+        "frozen_stages": 0,
+    }
 
 
 def test_given_norms_and_stages_stay() -> None:
@@ -74,13 +98,17 @@ def test_given_backbone_weights_come_before_the_shipped_network() -> None:
 
 
 def test_files_are_told_apart_by_their_content(tmp_path: Path) -> None:
-    state, checkpoint, other = (tmp_path / name for name in ("state.pth", "best.ckpt", "other.ckpt"))
+    state, checkpoint, other = (
+        tmp_path / name for name in ("state.pth", "best.ckpt", "other.ckpt")
+    )
     torch.save({"conv1.weight": torch.zeros(1)}, state)
     torch.save({"hyper_parameters": {"network": {"norm": "batch"}}, "state_dict": {}}, checkpoint)
     other.write_bytes(b"no weights")
     network = fields("hdc_net_n")
     assert choose_initial_weights(str(state), network) == InitialWeights("backbone", str(state))
-    assert choose_initial_weights(str(checkpoint), network) == InitialWeights("network", str(checkpoint), "batch")
+    assert choose_initial_weights(str(checkpoint), network) == InitialWeights(
+        "network", str(checkpoint), "batch"
+    )
     with pytest.raises(CohdcError, match=r"other\.ckpt: neither a checkpoint nor a state dict"):
         choose_initial_weights(str(other), network)
     with pytest.raises(CohdcError, match=r"persn: no such file; .*person, person_s"):
@@ -94,7 +122,11 @@ def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
     network = fields("resnet50")
     initial = choose_initial_weights("auto", network, last)
     assert initial.kind == "resumed"
-    assert resolve_network(initial, network) == {"weights": None, "norm": "frozen", "frozen_stages": 3}
+    assert resolve_network(initial, network) == {
+        "weights": None,
+        "norm": "frozen",
+        "frozen_stages": 3,
+    }
     assert "norm" not in resolve_network(initial, fields("resnet50", norm="batch"))
     assert resolve_backbone_lr(initial, None) == 0.2
     assert resolve_backbone_lr(initial, 0.7) == 0.7
@@ -103,7 +135,9 @@ def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
 def test_state_dict_is_refused_as_a_checkpoint_to_resume(tmp_path: Path) -> None:
     state = tmp_path / "state.pth"
     torch.save({"conv1.weight": torch.zeros(1)}, state)
-    with pytest.raises(CohdcError, match=r"state\.pth: not a checkpoint of cohdc fit; --pretrained takes"):
+    with pytest.raises(
+        CohdcError, match=r"state\.pth: not a checkpoint of cohdc fit; --pretrained takes"
+    ):
         choose_initial_weights("auto", fields("resnet50"), state)
 
 

@@ -37,15 +37,24 @@ def test_healthy_training_gets_no_hint() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"scores": {**HEALTHY.scores, "segm_AP50": 0.001}}, ["AP50 is 0.001 after 100 steps", "--overfit 8"]),
+        (
+            {"scores": {**HEALTHY.scores, "segm_AP50": 0.001}},
+            ["AP50 is 0.001 after 100 steps", "--overfit 8"],
+        ),
         (
             {"scores": {**HEALTHY.scores, "segm_AP50": 0.001}, "random_weights": True},
             ["from random weights on 1 images", "--pretrained auto"],
         ),
         ({"losses": [2.0] * 100}, ["the loss did not fall", "--lr_find"]),
         ({"scores": {**HEALTHY.scores, "segm_AP/car": 0.0}}, ["never detected: car (10 objects)"]),
-        ({"images": [image(10.0)]}, ["100% of the objects are smaller than 16 px", "--data.canvas"]),
-        ({"network": NetworkConfig(norm="batch"), "batch_size": 2}, ["batches of 2", "--data.batch_size"]),
+        (
+            {"images": [image(10.0)]},
+            ["100% of the objects are smaller than 16 px", "--data.canvas"],
+        ),
+        (
+            {"network": NetworkConfig(norm="batch"), "batch_size": 2},
+            ["batches of 2", "--data.batch_size"],
+        ),
     ],
 )
 def test_each_fault_has_its_hint(changes: dict[str, Any], words: list[str]) -> None:
@@ -81,7 +90,9 @@ def test_summary_tells_a_better_checkpoint_of_an_earlier_session(tmp_path: Path)
         ([2.0, 1.0], None),
     ],
 )
-def test_range_test_suggests_a_tenth_of_the_best_rate(losses: list[float], suggestion: float | None) -> None:
+def test_range_test_suggests_a_tenth_of_the_best_rate(
+    losses: list[float], suggestion: float | None
+) -> None:
     rates = [0.1 * step for step in range(len(losses))]
     found = suggest_rate(rates, losses)
     assert found == (None if suggestion is None else pytest.approx(suggestion))

@@ -1,4 +1,6 @@
-"""The shipped Table 3 configurations against the paper's table, and every configuration through the command line."""
+"""The shipped Table 3 configurations against the paper's table, and every configuration through the
+command line.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -9,8 +11,9 @@ import yaml
 from cohdc_train.presets import config_path
 from cohdc_train.train.cli import fit
 
-# Paper, Table 3 and the text of section 3.1.1: train images, validation images, epochs, (width, height) of the image,
-# side of the mini-mask, smallest anchor scale of four that double, learning rate, pre-trained model.
+# Paper, Table 3 and the text of section 3.1.1: train images, validation images, epochs, (width,
+# height) of the image, side of the mini-mask, smallest anchor scale of four that double, learning
+# rate, pre-trained model.
 TABLE = {
     1: (680, 120, 100, (1024, 800), 56, 32, 0.001, False),
     2: (680, 120, 200, (1024, 800), 56, 32, 0.001, False),
@@ -28,11 +31,18 @@ TABLE = {
 @pytest.mark.parametrize("test", TABLE)
 def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
     train, val, epochs, (width, height), mini, scale, lr, pretrained = TABLE[test]
-    network: dict[str, Any] = {"backbone": "resnet", "anchor_scales": [scale, 2 * scale, 4 * scale, 8 * scale]}
+    network: dict[str, Any] = {
+        "backbone": "resnet",
+        "anchor_scales": [scale, 2 * scale, 4 * scale, 8 * scale],
+    }
     if pretrained:
         network["weights"] = "IMAGENET1K_V1"
     expected: dict[str, Any] = {
-        "data": {"canvas": [height, width], "mini_mask": [mini, mini], "subset": {"train": train, "val": val}},
+        "data": {
+            "canvas": [height, width],
+            "mini_mask": [mini, mini],
+            "subset": {"train": train, "val": val},
+        },
         "model": {"network": network, "optimizer": {"name": "sgd", "lr": lr}},
         "trainer": {"max_epochs": epochs},
     }
@@ -42,7 +52,10 @@ def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
     assert yaml.safe_load(shipped.read_text(encoding="utf-8")) == expected
 
 
-NETWORKS = [f"networks/{path.name}" for path in sorted(config_path("networks/resnet50.yaml").parent.iterdir())]
+NETWORKS = [
+    f"networks/{path.name}"
+    for path in sorted(config_path("networks/resnet50.yaml").parent.iterdir())
+]
 
 
 def holds(resolved: Any, given: Any) -> bool:
@@ -55,7 +68,9 @@ def holds(resolved: Any, given: Any) -> bool:
 @pytest.mark.parametrize(
     "name", ["person.yaml", "table4.yaml", *NETWORKS, *(f"table3/test{i:02d}.yaml" for i in TABLE)]
 )
-def test_a_configuration_parses_and_resolves(name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_configuration_parses_and_resolves(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     with pytest.raises(SystemExit) as stop:
         fit(["--config", name, f"--data.root={tmp_path}", "--print_config"])
     assert stop.value.code == 0
@@ -68,4 +83,8 @@ def test_a_network_and_a_recipe_add_up(capsys: pytest.CaptureFixture[str], tmp_p
     with pytest.raises(SystemExit):
         fit([*both, f"--data.root={tmp_path}", "--print_config"])
     network = yaml.safe_load(capsys.readouterr().out)["model"]["network"]
-    assert (network["backbone"], network["fpn_channels"], network["mask_cut"]) == ("mobilenet_v2", 64, "quality")
+    assert (network["backbone"], network["fpn_channels"], network["mask_cut"]) == (
+        "mobilenet_v2",
+        64,
+        "quality",
+    )

@@ -29,7 +29,11 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library is left as it is")
 def test_blocks_that_were_freed_are_not_mapped_anew():
     faults = {
-        how: int(subprocess.run([sys.executable, "-c", ROUNDS, how], capture_output=True, text=True, check=True).stdout)
+        how: int(
+            subprocess.run(
+                [sys.executable, "-c", ROUNDS, how], capture_output=True, text=True, check=True
+            ).stdout
+        )
         for how in ("kept", "given back")
     }
     assert faults["given back"] > 100

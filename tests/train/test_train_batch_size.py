@@ -24,7 +24,10 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def module(canvas: tuple[int, int]) -> MaskRCNNModule:
-    return MaskRCNNModule(["person", "car"], NetworkConfig(depth=18, width=0.125, fpn_channels=8, fc=16, canvas=canvas))
+    return MaskRCNNModule(
+        ["person", "car"],
+        NetworkConfig(depth=18, width=0.125, fpn_channels=8, fc=16, canvas=canvas),
+    )
 
 
 def test_the_worst_batch_has_the_most_objects_and_fills_the_canvas(toy: Path) -> None:
@@ -44,14 +47,18 @@ def test_how_many_fit(one: float, two: float, budget: float, room: int) -> None:
 
 
 @pytest.mark.skipif(not batch_size._RESET.exists(), reason="needs Linux to tell its memory")
-def test_a_larger_canvas_leaves_room_for_fewer_images(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_larger_canvas_leaves_room_for_fewer_images(
+    toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(batch_size, "_free", lambda device: 2**30)
     found = {}
     for side in (256, 1024):
         built = module((side, side))
         before = {name: value.clone() for name, value in built.network.state_dict().items()}
         found[side] = batch_size.largest_batch(built, CocoDataModule(toy, canvas=(side, side)), CPU)
-        assert all(torch.equal(before[name], value) for name, value in built.network.state_dict().items())
+        assert all(
+            torch.equal(before[name], value) for name, value in built.network.state_dict().items()
+        )
     assert 1 <= found[1024] <= 8
     assert found[1024] < found[256]
 

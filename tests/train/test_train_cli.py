@@ -49,7 +49,9 @@ def run(toy: Path) -> Path:
 
 
 def test_a_fit_leaves_checkpoints_logs_and_its_configuration(run: Path) -> None:
-    assert {"best.ckpt", "last.ckpt", "config.yaml", "logs"} <= {path.name for path in run.iterdir()}
+    assert {"best.ckpt", "last.ckpt", "config.yaml", "logs"} <= {
+        path.name for path in run.iterdir()
+    }
     (log,) = (run / "logs").glob("*/metrics.csv")
     header = log.read_text().splitlines()[0].split(",")
     wanted = {
@@ -101,17 +103,28 @@ def test_what_is_no_checkpoint_is_told_in_one_line(tmp_path: Path, content: byte
     assert "\n" not in str(error.value)
 
 
-def test_the_last_checkpoint_is_of_the_last_epoch_even_when_an_earlier_one_is_best(toy: Path) -> None:
+def test_the_last_checkpoint_is_of_the_last_epoch_even_when_an_earlier_one_is_best(
+    toy: Path,
+) -> None:
     out = toy / "standstill"  # at this rate no epoch scores better than the first
     fit(arguments(toy, out, "--trainer.max_epochs=3", "--model.optimizer.lr=1e-12"))
-    epochs = {name: torch.load(out / f"{name}.ckpt", weights_only=True)["epoch"] for name in ("best", "last")}
+    epochs = {
+        name: torch.load(out / f"{name}.ckpt", weights_only=True)["epoch"]
+        for name in ("best", "last")
+    }
     assert epochs == {"best": 0, "last": 2}
 
 
 def test_training_logs_rates_speed_and_time_left(run: Path) -> None:
     (log,) = (run / "logs").glob("*/metrics.csv")
     header = set(log.read_text().splitlines()[0].split(","))
-    assert {"lr/heads", "lr/backbone", "speed/images_per_s", "speed/minutes_left", "train/loss"} <= header
+    assert {
+        "lr/heads",
+        "lr/backbone",
+        "speed/images_per_s",
+        "speed/minutes_left",
+        "train/loss",
+    } <= header
     assert {"val/segm_AP/person", "val/segm_AP/car"} <= header
 
 
@@ -121,9 +134,13 @@ def test_training_ends_with_scores_files_and_the_next_command(
     fit(arguments(toy, tmp_path))
     lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
     end = "\n".join(lines[-6:])
-    assert re.search(r"^best\.ckpt: mask AP \d\.\d{3}, AP50 \d\.\d{3} on the validation split$", end, re.M)
+    assert re.search(
+        r"^best\.ckpt: mask AP \d\.\d{3}, AP50 \d\.\d{3} on the validation split$", end, re.M
+    )
     assert re.search(r"^mask AP per class: person \d\.\d{3}, car \d\.\d{3}$", end, re.M)
-    assert re.search(r"^hint: AP50 is 0\.\d+ after 3 steps from random weights on 6 images", end, re.M)
+    assert re.search(
+        r"^hint: AP50 is 0\.\d+ after 3 steps from random weights on 6 images", end, re.M
+    )
     assert f"files in {tmp_path}: best.ckpt, last.ckpt, config.yaml, logs" in end
     assert lines[-1] == f"next: cohdc export {tmp_path / 'best.ckpt'} --images {toy / 'images'}"
     assert any(re.match(r"step 3; 6 images, .*loss .*lr .*mask AP .*AP50", line) for line in lines)
@@ -144,7 +161,9 @@ def test_training_stops_after_its_minutes(toy: Path, tmp_path: Path) -> None:
 
 
 def test_canvas_is_chosen_from_the_images_and_saved(toy: Path, tmp_path: Path) -> None:
-    (toy / "auto.yaml").write_text(TINY.replace("canvas: [48, 64]", "canvas: auto"), encoding="utf-8")
+    (toy / "auto.yaml").write_text(
+        TINY.replace("canvas: [48, 64]", "canvas: auto"), encoding="utf-8"
+    )
     fit(["--config", str(toy / "auto.yaml"), f"--data.root={toy}", f"--out={tmp_path}"])
     canvas = tuple(yaml.safe_load((tmp_path / "config.yaml").read_text())["data"]["canvas"])
     module = MaskRCNNModule.load(tmp_path / "best.ckpt")
@@ -187,9 +206,15 @@ def test_failed_download_names_the_flag_for_a_local_file(
     assert "--pretrained FILE.pth" in last
 
 
-@pytest.mark.filterwarnings("ignore:The dirpath has changed")  # a true warning, and here the intention
+@pytest.mark.filterwarnings(
+    "ignore:The dirpath has changed"
+)  # a true warning, and here the intention
 def test_training_resumes_with_more_epochs(toy: Path, run: Path) -> None:
-    trainer = fit(arguments(toy, toy / "resumed", "--trainer.max_epochs=2", f"--ckpt_path={run / 'last.ckpt'}"))
+    trainer = fit(
+        arguments(
+            toy, toy / "resumed", "--trainer.max_epochs=2", f"--ckpt_path={run / 'last.ckpt'}"
+        )
+    )
     assert (trainer.current_epoch, trainer.global_step) == (2, 6)
 
 
@@ -207,28 +232,44 @@ def test_other_classes_take_over_all_but_what_decides_between_classes(run: Path)
         module = MaskRCNNModule(names, before.network_config)
         own = {name: weights.clone() for name, weights in module.network.state_dict().items()}
         left = module.take_over(run / "last.ckpt")
-        assert {name.rsplit(".", 2)[-2] for name in left} == {"cls_score", "bbox_pred", "mask_fcn_logits", "quality"}
+        assert {name.rsplit(".", 2)[-2] for name in left} == {
+            "cls_score",
+            "bbox_pred",
+            "mask_fcn_logits",
+            "quality",
+        }
         old, new = before.network.state_dict(), module.network.state_dict()
         assert all(torch.equal(new[name], own[name] if name in left else old[name]) for name in new)
 
 
 def test_a_checkpoint_without_a_fitting_weight_is_refused(run: Path) -> None:
-    other = NetworkConfig(depth=50, width=0.25, fpn_channels=16, fc=32, anchor_scales=(8, 16, 32, 64))
+    other = NetworkConfig(
+        depth=50, width=0.25, fpn_channels=16, fc=32, anchor_scales=(8, 16, 32, 64)
+    )
     module = MaskRCNNModule(["dog"], other)
     module.network = torch.nn.ModuleDict({"another": torch.nn.Linear(1, 1)})  # type: ignore[assignment]
     with pytest.raises(CohdcError, match=r"last\.ckpt: none of the weights of its backbone fits"):
         module.take_over(run / "last.ckpt")
 
 
-def test_a_changed_class_map_is_refused(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["fit", *arguments(toy, toy / "no", "--data.classes=[car]", f"--ckpt_path={run / 'last.ckpt'}")])
+def test_a_changed_class_map_is_refused(
+    toy: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(
+        [
+            "fit",
+            *arguments(toy, toy / "no", "--data.classes=[car]", f"--ckpt_path={run / 'last.ckpt'}"),
+        ]
+    )
     assert code == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
         "cohdc fit: the checkpoint's classes are person, car; the data's are car"
     )
 
 
-def test_validate_prints_and_writes_the_scores(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_validate_prints_and_writes_the_scores(
+    toy: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = toy / "scores.json"
     assert main(["validate", str(run / "last.ckpt"), str(toy), "--workers=0", f"--out={out}"]) == 0
     assert {"segm_AP50", "box_AP", "S90_all"} <= set(json.loads(out.read_text()))
@@ -236,12 +277,16 @@ def test_validate_prints_and_writes_the_scores(toy: Path, run: Path, capsys: pyt
 
 
 def test_half_precision_trains(toy: Path) -> None:
-    trainer = fit(arguments(toy, toy / "bf16", "--trainer.precision=bf16-mixed", "--data.batch_size=3"))
+    trainer = fit(
+        arguments(toy, toy / "bf16", "--trainer.precision=bf16-mixed", "--data.batch_size=3")
+    )
     assert trainer.global_step == 2
 
 
 def test_a_diverged_loss_names_step_and_images(toy: Path) -> None:
-    with pytest.raises(CohdcError, match=r"^step \d+: the loss is not finite on images \d+, \d+:.*lower the lr$"):
+    with pytest.raises(
+        CohdcError, match=r"^step \d+: the loss is not finite on images \d+, \d+:.*lower the lr$"
+    ):
         fit(arguments(toy, toy / "nan", "--model.optimizer.lr=1e30", "--trainer.max_epochs=5"))
 
 
@@ -250,7 +295,9 @@ def test_an_unreadable_image_is_told_in_one_line_from_a_worker(tmp_path: Path) -
     (root / "tiny.yaml").write_text(TINY, encoding="utf-8")
     for path in (root / "images").glob("train_*"):
         path.write_bytes(b"not an image")
-    with pytest.raises(CohdcError, match=r"^\S+train_\d\.png: image \d cannot be read as an image$"):
+    with pytest.raises(
+        CohdcError, match=r"^\S+train_\d\.png: image \d cannot be read as an image$"
+    ):
         fit(arguments(root, tmp_path / "out", "--data.workers=1", "--trainer.limit_val_batches=0"))
 
 
@@ -276,7 +323,9 @@ def test_bad_values_are_told_in_one_line(
     assert message in last
 
 
-@pytest.mark.parametrize("wrong", ["--data.rot=x", "--model.network.canvas=[1,2]", "--data.batch_size=two"])
+@pytest.mark.parametrize(
+    "wrong", ["--data.rot=x", "--model.network.canvas=[1,2]", "--data.batch_size=two"]
+)
 def test_a_wrong_key_or_type_is_a_usage_error(toy: Path, wrong: str) -> None:
     with pytest.raises(SystemExit) as stop:
         fit(arguments(toy, toy / "bad", wrong))
@@ -302,8 +351,12 @@ def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> 
     assert shown["pictures"] is True
 
 
-def test_an_average_of_the_weights_is_validated_and_kept(toy: Path, run: Path, tmp_path: Path) -> None:
-    """Another network than the last step's, which is kept beside it so that a resume goes on from there."""
+def test_an_average_of_the_weights_is_validated_and_kept(
+    toy: Path, run: Path, tmp_path: Path
+) -> None:
+    """Another network than the last step's, which is kept beside it so that a resume goes on from
+    there.
+    """
     fit(arguments(toy, tmp_path, "--ema=0.99"))
     checkpoint = torch.load(tmp_path / "best.ckpt", weights_only=True)
     plain = torch.load(run / "best.ckpt", weights_only=True)
@@ -311,7 +364,15 @@ def test_an_average_of_the_weights_is_validated_and_kept(toy: Path, run: Path, t
     assert not torch.equal(checkpoint["state_dict"][name], plain["state_dict"][name])
     assert torch.equal(checkpoint["current_model_state"][name], plain["state_dict"][name])
     assert MaskRCNNModule.load(tmp_path / "best.ckpt").class_names == ["person", "car"]
-    fit(arguments(toy, tmp_path, "--ema=0.99", f"--ckpt_path={tmp_path / 'last.ckpt'}", "--trainer.max_epochs=2"))
+    fit(
+        arguments(
+            toy,
+            tmp_path,
+            "--ema=0.99",
+            f"--ckpt_path={tmp_path / 'last.ckpt'}",
+            "--trainer.max_epochs=2",
+        )
+    )
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 1
 
 
@@ -342,7 +403,9 @@ def test_validate_keeps_pictures_it_did_not_write(
     assert (tmp_path / "best.jpg").read_text() == "mine"
 
 
-def test_the_batch_size_is_found(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_batch_size_is_found(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     fit(arguments(toy, tmp_path, "--data.batch_size=auto", "--data.mini_mask=[28,28]"))
     assert "batch size: 32" in capsys.readouterr().out
     with pytest.raises(CohdcError, match="works on one device"):
@@ -351,10 +414,14 @@ def test_the_batch_size_is_found(toy: Path, tmp_path: Path, capsys: pytest.Captu
 
 @pytest.mark.slow
 def test_two_pictures_are_learnt_by_heart(tmp_path: Path) -> None:
-    """Trained and scored on the same two images, every object is found: the whole way from JSON to AP is sound."""
+    """Trained and scored on the same two images, every object is found: the whole way from JSON to
+    AP is sound.
+    """
     root = coco_toys.folder(tmp_path, train=2)
     (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
-    same = [f"--data.paths.{split}_{kind}" for split in ("train", "val") for kind in ("json", "images")]
+    same = [
+        f"--data.paths.{split}_{kind}" for split in ("train", "val") for kind in ("json", "images")
+    ]
     places = [root / "instances_train.json", root / "images"] * 2
     trainer = fit(
         [
@@ -410,8 +477,17 @@ def test_interrupted_training_keeps_its_last_step(
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 2
 
 
-def test_network_of_a_resumed_training_has_to_agree(toy: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["fit", *arguments(toy, toy / "no", "--model.network.fc=32", f"--ckpt_path={run / 'last.ckpt'}")])
+def test_network_of_a_resumed_training_has_to_agree(
+    toy: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(
+        [
+            "fit",
+            *arguments(
+                toy, toy / "no", "--model.network.fc=32", f"--ckpt_path={run / 'last.ckpt'}"
+            ),
+        ]
+    )
     assert code == 1
     last = capsys.readouterr().err.splitlines()[-1]
     assert "the checkpoint's network has fc 16, this one 32; give --config of its training" in last

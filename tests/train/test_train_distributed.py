@@ -14,16 +14,29 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 import coco_toys
 
 HERE = Path(__file__).parent
-TIMEOUT_S = 240  # several times what a run takes; a rank that waits for another waits for half an hour
+TIMEOUT_S = (
+    240  # several times what a run takes; a rank that waits for another waits for half an hour
+)
 STEPS = 6
 TOLERANCE = 2e-6  # of the loss, relative; 1.2e-7 measured
-# Nothing here is drawn or depends on who else is in the batch: 255 anchors are fewer than the 256 that train the RPN,
-# objects of 6 px are found by no proposal, so that the true boxes are the positive ones, and every image has two.
+# Nothing here is drawn or depends on who else is in the batch: 255 anchors are fewer than the 256
+# that train the RPN, objects of 6 px are found by no proposal, so that the true boxes are the
+# positive ones, and every image has two.
 EXACT: dict[str, Any] = {
-    "data": {"canvas": [32, 32], "workers": 0, "augment": {"flip": 0.0, "scale_jitter": [1, 1], "photometric": False}},
+    "data": {
+        "canvas": [32, 32],
+        "workers": 0,
+        "augment": {"flip": 0.0, "scale_jitter": [1, 1], "photometric": False},
+    },
     "model": {
         "network": {
-            **{"depth": 18, "width": 0.125, "fpn_channels": 8, "fc": 16, "anchor_scales": [16, 32, 64, 128]},
+            **{
+                "depth": 18,
+                "width": 0.125,
+                "fpn_channels": 8,
+                "fc": 16,
+                "anchor_scales": [16, 32, 64, 128],
+            },
             **{"norm": "frozen", "rois": 64, "proposals": [10, 10]},
         },
         "optimizer": {"name": "sgd", "lr": 0.02, "warmup_steps": 0},
@@ -36,12 +49,19 @@ EXACT: dict[str, Any] = {
 
 
 def folder(root: Path, boxes: dict[str, list[tuple[tuple[int, int], ...]]]) -> Path:
-    """Toy images with a person and a car of 12 px each; boxes: split -> per image the corners of its objects."""
+    """Toy images with a person and a car of 12 px each; boxes: split -> per image the corners of
+    its objects.
+    """
     for split, images in boxes.items():
         files, rows = [], []
         for i, corners in enumerate(images, 1):
-            drawn = [coco_toys.rectangle(i, 10 * (j + 1), (*corner, 12, 12), 0) for j, corner in enumerate(corners)]
-            coco_toys.draw_image(root / "images" / f"{split}_{i}.png", drawn, seed=len(split) * 100 + i)
+            drawn = [
+                coco_toys.rectangle(i, 10 * (j + 1), (*corner, 12, 12), 0)
+                for j, corner in enumerate(corners)
+            ]
+            coco_toys.draw_image(
+                root / "images" / f"{split}_{i}.png", drawn, seed=len(split) * 100 + i
+            )
             rows += [row | {"id": len(rows) + k} for k, row in enumerate(drawn, 1)]
             files.append({"id": i, "file_name": f"{split}_{i}.png", "height": 48, "width": 64})
         content = {"images": files, "annotations": rows, "categories": coco_toys.CATEGORIES}
@@ -49,19 +69,40 @@ def folder(root: Path, boxes: dict[str, list[tuple[tuple[int, int], ...]]]) -> P
     return root
 
 
-def fit(root: Path, out: Path, processes: int, batch_size: int, apart: bool = False) -> list[dict[str, Any]]:
+def fit(
+    root: Path, out: Path, processes: int, batch_size: int, apart: bool = False
+) -> list[dict[str, Any]]:
     """Run `cohdc fit` in processes of its own; returns what the probe wrote, rank by rank."""
     config = yaml.safe_load(yaml.safe_dump(EXACT))
     config["data"] |= {"root": str(root), "batch_size": batch_size}
-    config["trainer"] |= {"devices": processes, "max_epochs": STEPS} | ({"strategy": "ddp"} if processes > 1 else {})
-    probe = {"class_path": "distributed_probe.Probe", "init_args": {"folder": str(out), "apart": apart}}
+    config["trainer"] |= {"devices": processes, "max_epochs": STEPS} | (
+        {"strategy": "ddp"} if processes > 1 else {}
+    )
+    probe = {
+        "class_path": "distributed_probe.Probe",
+        "init_args": {"folder": str(out), "apart": apart},
+    }
     config["trainer"]["callbacks"] = [probe]
     out.mkdir(parents=True)
     (out / "run.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    places = os.pathsep.join([str(HERE), str(HERE.parent / "data"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    places = os.pathsep.join(
+        [str(HERE), str(HERE.parent / "data"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
     done = subprocess.run(
-        [sys.executable, "-m", "cohdc_train", "fit", "--config", str(out / "run.yaml"), "--out", str(out)],
-        **{"cwd": HERE.parents[1], "env": {**os.environ, "PYTHONPATH": places, "OMP_NUM_THREADS": "1"}},
+        [
+            sys.executable,
+            "-m",
+            "cohdc_train",
+            "fit",
+            "--config",
+            str(out / "run.yaml"),
+            "--out",
+            str(out),
+        ],
+        **{
+            "cwd": HERE.parents[1],
+            "env": {**os.environ, "PYTHONPATH": places, "OMP_NUM_THREADS": "1"},
+        },
         **{"capture_output": True, "text": True, "timeout": TIMEOUT_S},
     )
     assert done.returncode == 0, done.stderr[-3000:]
@@ -119,12 +160,17 @@ def test_validation_counts_every_image_once(one: Any, two: Any) -> None:
 
 @pytest.mark.slow
 def test_gradients_that_are_not_averaged_show(root: Path, one: Any) -> None:
-    """The comparison above has teeth: with the fault planted, the first loss is the same and the later ones are not."""
+    """The comparison above has teeth: with the fault planted, the first loss is the same and the
+    later ones are not.
+    """
     apart = fit(root, root / "apart", processes=2, batch_size=2, apart=True)
     off = (curve(apart) / curve(one) - 1).abs()
     assert off[0] < TOLERANCE
     assert off[1:].max() > 1e-3  # 1.2e-2 measured
-    assert not all(torch.equal(weight, apart[1]["weights"][name]) for name, weight in apart[0]["weights"].items())
+    assert not all(
+        torch.equal(weight, apart[1]["weights"][name])
+        for name, weight in apart[0]["weights"].items()
+    )
 
 
 @pytest.mark.slow
@@ -133,4 +179,7 @@ def test_a_rank_without_an_object_finishes(tmp_path: Path) -> None:
     boxes = {"train": [((4, 8), (40, 20)), ()], "val": [((4, 8), (40, 20))]}
     ranks = fit(folder(tmp_path, boxes), tmp_path / "out", processes=2, batch_size=1)
     assert [len(rank["losses"]) for rank in ranks] == [STEPS, STEPS]
-    assert all(torch.equal(weight, ranks[1]["weights"][name]) for name, weight in ranks[0]["weights"].items())
+    assert all(
+        torch.equal(weight, ranks[1]["weights"][name])
+        for name, weight in ranks[0]["weights"].items()
+    )

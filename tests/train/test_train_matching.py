@@ -14,12 +14,18 @@ LEFT, RIGHT, EMPTY = [10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0], [10.0, 
 LOWER = [10.0, 14.0, 30.0, 34.0]  # overlaps LEFT by 16 of 24 rows
 
 
-def results_of(truth: dict[str, Any], boxes: Any, scores: Any, labels: Any = None, quality: Any = None) -> Results:
-    """Detections that fill their boxes, in image 7. labels: 0-based, of the first class unless given."""
+def results_of(
+    truth: dict[str, Any], boxes: Any, scores: Any, labels: Any = None, quality: Any = None
+) -> Results:
+    """Detections that fill their boxes, in image 7. labels: 0-based, of the first class unless
+    given.
+    """
     names = [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}, {"id": 3, "name": "dog"}]
     metrics = SegmentationMetrics({**truth, "categories": names})
     found = detection(boxes, scores, quality or [0.9] * len(boxes))
-    metrics.update(7, found | {"labels": torch.tensor(labels or [0] * len(boxes), dtype=torch.int64)})
+    metrics.update(
+        7, found | {"labels": torch.tensor(labels or [0] * len(boxes), dtype=torch.int64)}
+    )
     return metrics.results()
 
 
@@ -38,8 +44,12 @@ def only(results: Results) -> ImageMatch:
 def test_an_image_scores_iou_over_objects_and_false_detections() -> None:
     assert only(results_of(two(), [LEFT, RIGHT], [0.9, 0.9])).score == pytest.approx(1.0)
     assert only(results_of(two(), [LEFT], [0.9])).score == pytest.approx(1 / 2)
-    assert only(results_of(two(), [LOWER, RIGHT, EMPTY], [0.9, 0.8, 0.7])).score == pytest.approx((2 / 3 + 1) / 3)
-    assert only(results_of(two(), [LOWER, LEFT], [0.9, 0.8])).score == pytest.approx((2 / 3) / 3), "the surest first"
+    assert only(results_of(two(), [LOWER, RIGHT, EMPTY], [0.9, 0.8, 0.7])).score == pytest.approx(
+        (2 / 3 + 1) / 3
+    )
+    assert only(results_of(two(), [LOWER, LEFT], [0.9, 0.8])).score == pytest.approx((2 / 3) / 3), (
+        "the surest first"
+    )
     assert only(results_of(two(), [], [])).score == 0
 
 
@@ -76,7 +86,9 @@ def test_confusion_counts_hits_misses_false_ones_and_other_classes() -> None:
     boxes, labels = [LEFT, RIGHT, EMPTY], [0, 2, 1]
     matches = match_images(results_of(truth, boxes, [0.9, 0.8, 0.7], labels))
     expected = np.zeros((4, 4), np.int64)
-    expected[0, 0] = expected[1, 2] = expected[3, 1] = 1  # person found, car taken for a dog, a car where nothing is
+    expected[0, 0] = expected[1, 2] = expected[3, 1] = (
+        1  # person found, car taken for a dog, a car where nothing is
+    )
     np.testing.assert_array_equal(confusion_matrix(matches, 3), expected)
     nothing = confusion_matrix(match_images(results_of(truth, [], [])), 3)
     assert (nothing[0, 3], nothing[1, 3], nothing.sum()) == (1, 1, 2)
@@ -86,10 +98,14 @@ def test_ranking_takes_no_image_twice_and_no_image_without_a_score() -> None:
     def match(image_id: int, objects: int, false: int) -> ImageMatch:
         rows = [{"category_id": 1}] * objects
         found = np.full(objects, -1, np.int64)
-        return ImageMatch(image_id, rows, [], [{"category_id": 1}] * false, found, np.zeros((false, objects)))
+        return ImageMatch(
+            image_id, rows, [], [{"category_id": 1}] * false, found, np.zeros((false, objects))
+        )
 
     empty, missed, crowded, false = match(1, 0, 0), match(2, 1, 0), match(3, 5, 1), match(4, 0, 1)
-    found = ImageMatch(5, [{"category_id": 1}], [], [{"category_id": 1}], np.array([0]), np.array([[0.8]]))
+    found = ImageMatch(
+        5, [{"category_id": 1}], [], [{"category_id": 1}], np.array([0]), np.array([[0.8]])
+    )
     best, worst = ranked([empty, missed, crowded, false, found], 2)
     assert [m.image_id for m in best] == [5, 4]
     assert [m.image_id for m in worst] == [3, 2]

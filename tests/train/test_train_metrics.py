@@ -32,7 +32,12 @@ def rle_of(mask: NDArray[Any]) -> dict[str, Any]:
 
 def blob(rng: np.random.Generator) -> NDArray[np.uint8]:
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    cy, cx, ry, rx = rng.uniform(10, 50), rng.uniform(10, 70), rng.uniform(4, 15), rng.uniform(4, 20)
+    cy, cx, ry, rx = (
+        rng.uniform(10, 50),
+        rng.uniform(10, 70),
+        rng.uniform(4, 15),
+        rng.uniform(4, 20),
+    )
     return (((y - cy) / ry) ** 2 + ((x - cx) / rx) ** 2 < 1).astype(np.uint8)
 
 
@@ -42,7 +47,9 @@ def row_of(mask: NDArray[np.uint8], **more: Any) -> dict[str, Any]:
 
 
 def random_problem(seed: int) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Ground truth with crowd, classes without objects and images without objects, and jittered detections."""
+    """Ground truth with crowd, classes without objects and images without objects, and jittered
+    detections.
+    """
     rng = np.random.default_rng(seed)
     truth: dict[str, Any] = {
         "images": [],
@@ -54,13 +61,19 @@ def random_problem(seed: int) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         truth["images"].append({"id": image_id, "height": SIZE[0], "width": SIZE[1]})
         for _ in range(int(rng.integers(0, 5))):
             mask, category = blob(rng), int(rng.integers(1, 3))
-            row = row_of(mask, id=len(truth["annotations"]) + 1, image_id=image_id, category_id=category)
-            truth["annotations"].append({**row, "area": float(mask.sum()), "iscrowd": int(rng.random() < 0.2)})
+            row = row_of(
+                mask, id=len(truth["annotations"]) + 1, image_id=image_id, category_id=category
+            )
+            truth["annotations"].append(
+                {**row, "area": float(mask.sum()), "iscrowd": int(rng.random() < 0.2)}
+            )
             for _ in range(int(rng.integers(0, 3))):
                 moved = np.roll(mask, tuple(rng.integers(-4, 5, 2)), (0, 1))
                 score = float(rng.random())
                 results.append(row_of(moved, image_id=image_id, category_id=category, score=score))
-        results.append(row_of(blob(rng), image_id=image_id, category_id=1, score=float(rng.random())))
+        results.append(
+            row_of(blob(rng), image_id=image_id, category_id=1, score=float(rng.random()))
+        )
     return truth, results
 
 
@@ -91,7 +104,9 @@ def test_average_precision_equals_pycocotools(seed: int, kind: Any) -> None:
 
 
 def band(mask: NDArray[np.uint8], width: int) -> NDArray[np.bool_]:
-    """The pixels of a mask that have one outside of it, or the picture's edge, within `width` rows and columns."""
+    """The pixels of a mask that have one outside of it, or the picture's edge, within `width` rows
+    and columns.
+    """
     inner = np.ones(mask.shape, np.bool_)
     padded = np.pad(mask, width)
     for dy in range(2 * width + 1):
@@ -115,9 +130,13 @@ def test_calibration_compares_quality_with_the_true_iou() -> None:
     truth = truth_of(square(10, 10, 20), square(50, 10, 20))
     moved = [square(10, 10, 20), square(50, 14, 20), square(10, 40, 10), square(50, 10, 20)]
     true = [1.0, 320 / 480, 0.0, 1.0]
-    quality, scores = [0.9, 0.7, 0.2, 0.1], [0.9, 0.8, 0.7, 0.4]  # the last is not sure enough to count
+    quality, scores = (
+        [0.9, 0.7, 0.2, 0.1],
+        [0.9, 0.8, 0.7, 0.4],
+    )  # the last is not sure enough to count
     rows = [
-        row_of(m, image_id=7, category_id=1, score=s, quality=q) for m, s, q in zip(moved, scores, quality, strict=True)
+        row_of(m, image_id=7, category_id=1, score=s, quality=q)
+        for m, s, q in zip(moved, scores, quality, strict=True)
     ]
     found = calibration(truth, rows)
     assert found["quality_spearman"] == pytest.approx(1.0)
@@ -135,14 +154,23 @@ def square(x: int, y: int, side: int) -> NDArray[np.uint8]:
 
 def truth_of(*masks: NDArray[np.uint8], crowd: bool = False) -> dict[str, Any]:
     rows = [
-        {**row_of(m), "id": i + 1, "image_id": 7, "category_id": 1, "area": float(m.sum()), "iscrowd": int(crowd)}
+        {
+            **row_of(m),
+            "id": i + 1,
+            "image_id": 7,
+            "category_id": 1,
+            "area": float(m.sum()),
+            "iscrowd": int(crowd),
+        }
         for i, m in enumerate(masks)
     ]
     image = {"id": 7, "height": SIZE[0], "width": SIZE[1]}
     return {"images": [image], "categories": [{"id": 1, "name": "person"}], "annotations": rows}
 
 
-def detection(boxes: list[list[float]], scores: list[float], quality: list[float]) -> dict[str, torch.Tensor]:
+def detection(
+    boxes: list[list[float]], scores: list[float], quality: list[float]
+) -> dict[str, torch.Tensor]:
     n = len(boxes)
     return {
         "boxes": torch.tensor(boxes).reshape(n, 4),
@@ -191,7 +219,9 @@ def test_the_filter_leaves_out_what_quality_doubts() -> None:
     boxes = [[10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0]]
     found = []
     for least in (0.0, 0.9):
-        metrics = SegmentationMetrics(truth_of(square(10, 10, 20), square(50, 10, 20)), min_quality=least)
+        metrics = SegmentationMetrics(
+            truth_of(square(10, 10, 20), square(50, 10, 20)), min_quality=least
+        )
         metrics.update(7, detection(boxes, [0.9, 0.8], [0.95, 0.85]))
         found.append(metrics.compute())
     assert [scores["segm_AP"] for scores in found] == pytest.approx([1.0, 51 / 101])
@@ -201,7 +231,9 @@ def test_the_filter_leaves_out_what_quality_doubts() -> None:
 def test_a_detection_takes_one_object_and_the_better_score_goes_first() -> None:
     truth = truth_of(square(10, 10, 20))
     rows = [row_of(square(10, 10, 20), image_id=7, category_id=1, score=0.5)]
-    rows.append(row_of(square(10, 14, 20), image_id=7, category_id=1, score=0.8))  # IoU 2/3 comes first
+    rows.append(
+        row_of(square(10, 14, 20), image_id=7, category_id=1, score=0.8)
+    )  # IoU 2/3 comes first
     assert match_masks(truth, rows) == pytest.approx([320 / 480])
     rows.append(row_of(square(10, 30, 20), image_id=7, category_id=1, score=0.9))  # touches nothing
     assert match_masks(truth, rows) == pytest.approx([320 / 480])

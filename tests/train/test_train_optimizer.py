@@ -37,7 +37,9 @@ def module(total: float = 1000, **options: Any) -> MaskRCNNModule:
 
 def test_rate_warms_up_and_ends_at_its_fraction() -> None:
     config = OptimizerConfig(warmup_ratio=0.1, final_fraction=0.1)
-    assert config.factor(0, 0.05) == pytest.approx(0.5 * (0.1 + 0.9 * 0.5 * (1 + math.cos(0.05 * math.pi))))
+    assert config.factor(0, 0.05) == pytest.approx(
+        0.5 * (0.1 + 0.9 * 0.5 * (1 + math.cos(0.05 * math.pi)))
+    )
     assert config.factor(0, 0.5) == pytest.approx(0.55)
     assert config.factor(0, 1.0) == pytest.approx(0.1)
     assert OptimizerConfig(final_fraction=1.0).factor(0, 0.9) == 1.0
@@ -45,16 +47,24 @@ def test_rate_warms_up_and_ends_at_its_fraction() -> None:
 
 def test_warmup_in_steps_replaces_the_share_of_the_budget() -> None:
     config = OptimizerConfig(warmup_steps=9, final_fraction=1.0)
-    assert [config.factor(step, 0.5) for step in (0, 4, 9, 50)] == pytest.approx([0.1, 0.5, 1.0, 1.0])
+    assert [config.factor(step, 0.5) for step in (0, 4, 9, 50)] == pytest.approx(
+        [0.1, 0.5, 1.0, 1.0]
+    )
 
 
-@given(warmup=st.just(0.0) | st.floats(1e-3, 0.5), first=st.floats(0.0, 1.0), second=st.floats(0.0, 1.0))
+@given(
+    warmup=st.just(0.0) | st.floats(1e-3, 0.5),
+    first=st.floats(0.0, 1.0),
+    second=st.floats(0.0, 1.0),
+)
 def test_rate_is_continuous_in_the_budget_used(warmup: float, first: float, second: float) -> None:
     """No jump at the end of the warm-up, wherever steps or a clock put the training."""
     config = OptimizerConfig(warmup_ratio=warmup)
     steepest = (1 / warmup if warmup else 0.0) + math.pi / 2
     change = abs(config.factor(5, first) - config.factor(5, second))
-    assert change <= steepest * abs(first - second) + 1.1e-3  # the first step has 1e-3 of the rate, never 0
+    assert (
+        change <= steepest * abs(first - second) + 1.1e-3
+    )  # the first step has 1e-3 of the rate, never 0
 
 
 @given(warmup=st.floats(0.0, 0.5))
@@ -75,13 +85,21 @@ def test_biases_and_norms_do_not_decay(name: Any, kind: type) -> None:
     for group in optimizer.param_groups:
         kinds = {p.ndim > 1 for p in group["params"]}
         assert kinds == {group["weight_decay"] == 0.1}
-    assert sum(len(group["params"]) for group in optimizer.param_groups) == len(list(built.network.parameters()))
+    assert sum(len(group["params"]) for group in optimizer.param_groups) == len(
+        list(built.network.parameters())
+    )
 
 
 def test_frozen_stages_are_not_optimized() -> None:
-    built = MaskRCNNModule(["person"], NetworkConfig(**{**TINY.__dict__, "frozen_stages": 2, "norm": "frozen"}))
+    built = MaskRCNNModule(
+        ["person"], NetworkConfig(**{**TINY.__dict__, "frozen_stages": 2, "norm": "frozen"})
+    )
     built._trainer = Steps(10)  # type: ignore[assignment]
-    optimized = {id(p) for group in built.configure_optimizers()["optimizer"].param_groups for p in group["params"]}
+    optimized = {
+        id(p)
+        for group in built.configure_optimizers()["optimizer"].param_groups
+        for p in group["params"]
+    }
     assert id(built.network.backbone.body.conv1.weight) not in optimized
 
 
@@ -90,14 +108,23 @@ def test_a_schedule_without_an_end_is_refused() -> None:
         module(total=float("inf")).configure_optimizers()
 
 
-def test_rate_follows_the_clock_where_time_ends_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rate_follows_the_clock_where_time_ends_the_training(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     clock = {"now": 0.0}
     monkeypatch.setattr(Timer, "time_elapsed", lambda self, stage="train": clock["now"])
-    options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    options = {
+        "accelerator": "cpu",
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+    }
     trainer = Trainer(max_epochs=-1, max_time={"seconds": 100}, **options)
     progress = training_progress(trainer, math.inf)
     assert progress is not None
-    config = OptimizerConfig(warmup_ratio=0.1, lr=1.0, final_fraction=0.0, backbone_lr=0.5, frozen_steps=3)
+    config = OptimizerConfig(
+        warmup_ratio=0.1, lr=1.0, final_fraction=0.0, backbone_lr=0.5, frozen_steps=3
+    )
     optimizer, schedule = build_optimizer(config, MaskRCNN(1, TINY), progress, False)
     rates = []
     for seconds in range(5, 101, 5):
@@ -106,7 +133,9 @@ def test_rate_follows_the_clock_where_time_ends_the_training(monkeypatch: pytest
             optimizer.step()
             schedule.step()
         rates.append(schedule.get_last_lr())
-    assert [heads for heads, *_ in rates] == pytest.approx([config.factor(0, s / 100) for s in range(5, 101, 5)])
+    assert [heads for heads, *_ in rates] == pytest.approx(
+        [config.factor(0, s / 100) for s in range(5, 101, 5)]
+    )
     assert rates[9][0] == pytest.approx(0.5)
     assert rates[-1][0] == pytest.approx(0.0, abs=1e-12)
     assert all(body == pytest.approx(0.5 * heads) for heads, _, body, *_ in rates)
@@ -114,7 +143,12 @@ def test_rate_follows_the_clock_where_time_ends_the_training(monkeypatch: pytest
 
 def test_progress_is_the_further_of_steps_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Timer, "time_elapsed", lambda self, stage="train": 30.0)
-    options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    options = {
+        "accelerator": "cpu",
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+    }
     timed = training_progress(Trainer(max_epochs=3, max_time={"seconds": 100}, **options), 50)
     counted = training_progress(Trainer(max_epochs=3, **options), 50)
     assert timed is not None
@@ -126,7 +160,13 @@ def test_progress_is_the_further_of_steps_and_time(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize(
     "options",
-    [{"lr": 0.0}, {"final_fraction": 1.5}, {"backbone_lr": -1.0}, {"warmup_ratio": 1.0}, {"warmup_steps": -1}],
+    [
+        {"lr": 0.0},
+        {"final_fraction": 1.5},
+        {"backbone_lr": -1.0},
+        {"warmup_ratio": 1.0},
+        {"warmup_steps": -1},
+    ],
 )
 def test_senseless_rates_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"lr|warmup"):
@@ -148,7 +188,12 @@ def rates(built: MaskRCNNModule, steps: int) -> list[tuple[float, float]]:
 
 
 def test_backbone_is_frozen_then_follows_at_its_share() -> None:
-    found = rates(module(total=20, lr=1e-3, warmup_steps=0, frozen_steps=5, backbone_lr=0.1, final_fraction=1.0), 20)
+    found = rates(
+        module(
+            total=20, lr=1e-3, warmup_steps=0, frozen_steps=5, backbone_lr=0.1, final_fraction=1.0
+        ),
+        20,
+    )
     assert [backbone for backbone, _ in found] == pytest.approx([0.0] * 5 + [1e-4] * 15)
     assert [rest for _, rest in found] == pytest.approx([1e-3] * 20)
 
@@ -158,7 +203,10 @@ def test_frozen_backbone_keeps_its_weights(name: Any) -> None:
     torch.manual_seed(0)
     built = module(total=10, name=name, lr=0.1, frozen_steps=2, warmup_steps=0)
     configured = built.configure_optimizers()
-    body, other = built.network.backbone.body.layer1[0].conv1.weight, built.network.rpn.head.bbox_pred.weight
+    body, other = (
+        built.network.backbone.body.layer1[0].conv1.weight,
+        built.network.rpn.head.bbox_pred.weight,
+    )
     before = body.detach().clone(), other.detach().clone()
     for parameter in built.network.parameters():
         parameter.grad = torch.ones_like(parameter)

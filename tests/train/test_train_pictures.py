@@ -48,12 +48,18 @@ def seen(content: bytes) -> Any:
 
 def photograph(folder: Path, image_id: int, size: tuple[int, int] = SIZE) -> CocoImage:
     path = folder / f"{image_id}.png"
-    cv2.imwrite(str(path), np.random.default_rng(image_id).integers(0, 255, (*size, 3), dtype=np.uint8))
+    cv2.imwrite(
+        str(path), np.random.default_rng(image_id).integers(0, 255, (*size, 3), dtype=np.uint8)
+    )
     return CocoImage(image_id, path, *size, ())
 
 
 def test_precision_is_cocos_at_both_ious() -> None:
-    boxes = [LEFT, [10.0, 38.0, 30.0, 58.0], [50.0, 14.0, 70.0, 34.0]]  # right, false, right with IoU 2/3
+    boxes = [
+        LEFT,
+        [10.0, 38.0, 30.0, 58.0],
+        [50.0, 14.0, 70.0, 34.0],
+    ]  # right, false, right with IoU 2/3
     precision = results_of(two(), boxes, [0.9, 0.8, 0.7]).precision
     assert precision.shape == (10, 101, 3)
     at = {iou: precision[int(np.argmin(np.abs(IOUS - iou))), :, 0] for iou in (0.5, 0.75)}
@@ -72,10 +78,21 @@ def test_precision_is_cocos_at_both_ious() -> None:
         (truth_of(), [], []),
         (truth_of(), [LEFT], [0.3]),
     ],
-    ids=["two classes of three", "no quality", "no detections", "crowd only", "nothing at all", "false only"],
+    ids=[
+        "two classes of three",
+        "no quality",
+        "no detections",
+        "crowd only",
+        "nothing at all",
+        "false only",
+    ],
 )
-def test_a_validation_is_drawn_whatever_it_found(truth: Any, boxes: Any, quality: Any, tmp_path: Path) -> None:
-    results = results_of(truth, boxes, [0.9] * len(boxes), [k % 3 for k in range(len(boxes))], quality)
+def test_a_validation_is_drawn_whatever_it_found(
+    truth: Any, boxes: Any, quality: Any, tmp_path: Path
+) -> None:
+    results = results_of(
+        truth, boxes, [0.9] * len(boxes), [k % 3 for k in range(len(boxes))], quality
+    )
     files = draw_validation(results, [photograph(tmp_path, 7)])
     assert set(files) == VALIDATION
     empty = not boxes and not any(not row["iscrowd"] for row in truth["annotations"])
@@ -86,13 +103,25 @@ def test_a_validation_is_drawn_whatever_it_found(truth: Any, boxes: Any, quality
 
 def test_images_of_different_sizes_share_a_grid(tmp_path: Path) -> None:
     truth = two()
-    truth["images"] += [{"id": 8, "height": 300, "width": 20}, {"id": 9, "height": 700, "width": 1300}]
+    truth["images"] += [
+        {"id": 8, "height": 300, "width": 20},
+        {"id": 9, "height": 700, "width": 1300},
+    ]
     box = {"iscrowd": 0, "category_id": 1, "area": 100.0, "bbox": [2, 2, 10, 10]}
     shape = [[2, 2, 12, 2, 12, 12, 2, 12]]
-    truth["annotations"] += [{**box, "id": 10 + i, "image_id": i, "segmentation": shape} for i in (8, 9)]
+    truth["annotations"] += [
+        {**box, "id": 10 + i, "image_id": i, "segmentation": shape} for i in (8, 9)
+    ]
     results = results_of(truth, [LEFT], [0.9])
-    more = Results({**results.truth, "images": truth["images"], "annotations": truth["annotations"]}, *rest(results))
-    images = [photograph(tmp_path, 7), photograph(tmp_path, 8, (300, 20)), photograph(tmp_path, 9, (700, 1300))]
+    more = Results(
+        {**results.truth, "images": truth["images"], "annotations": truth["annotations"]},
+        *rest(results),
+    )
+    images = [
+        photograph(tmp_path, 7),
+        photograph(tmp_path, 8, (300, 20)),
+        photograph(tmp_path, 9, (700, 1300)),
+    ]
     grids = [seen(draw_validation(more, images)[name]) for name in ("best.jpg", "worst.jpg")]
     assert grids[0].shape == grids[1].shape
 
@@ -104,7 +133,10 @@ def rest(results: Results) -> tuple[Any, ...]:
 def test_missed_and_false_are_red_and_found_is_not(tmp_path: Path) -> None:
     def reds(boxes: list[list[float]]) -> int:
         results = results_of(two(), boxes, [0.9] * len(boxes))
-        b, g, r = (channel.astype(int) for channel in cv2.split(seen(draw_validation(results, [grey])["best.jpg"])))
+        b, g, r = (
+            channel.astype(int)
+            for channel in cv2.split(seen(draw_validation(results, [grey])["best.jpg"]))
+        )
         return int(((r > b + 60) & (r > g + 60)).sum())
 
     grey = photograph(tmp_path, 7)
@@ -119,18 +151,24 @@ def test_the_calibrations_title_tells_the_scores(monkeypatch: pytest.MonkeyPatch
 
     titles: list[str] = []
     monkeypatch.setattr(Axes, "set_title", lambda self, text, **_: titles.append(text))
-    results = results_of(two(), [LEFT, LOWER, RIGHT, RIGHT], [0.9] * 4, quality=[0.95, 0.5, 0.8, 0.9])
+    results = results_of(
+        two(), [LEFT, LOWER, RIGHT, RIGHT], [0.9] * 4, quality=[0.95, 0.5, 0.8, 0.9]
+    )
     plot_calibration(results)
     scores = calibration(results.truth, results.rows)
     spearman, error = scores["quality_spearman"], scores["quality_error"]
-    assert titles == [f"4 detections of class score ≥ 0.5\nSpearman {spearman:.3f}, mean error {error:.3f}"]
+    assert titles == [
+        f"4 detections of class score ≥ 0.5\nSpearman {spearman:.3f}, mean error {error:.3f}"
+    ]
 
 
 @pytest.mark.parametrize("classes", [1, 9, 80])
 def test_many_classes_with_odd_names_are_drawn(classes: int) -> None:
     truth, rows = random_problem(0)
     odd = ["_hidden", "a$b$c", "ein sehr langer Name eines Gegenstands"]
-    truth["categories"] = [{"id": i + 1, "name": odd[i] if i < 3 else f"c{i}"} for i in range(classes)]
+    truth["categories"] = [
+        {"id": i + 1, "name": odd[i] if i < 3 else f"c{i}"} for i in range(classes)
+    ]
     for row in [*truth["annotations"], *rows]:
         row["category_id"] = 1 + row["image_id"] * 7 % classes
     precision = precision_table(truth, rows, "segm")
@@ -161,16 +199,41 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(toy: Path) -> Callable[..., Path]:
     def train(name: str, *more: str) -> Path:
         out = toy / name
-        fit(["--config", str(toy / "tiny.yaml"), f"--data.root={toy}", f"--out={out}", "--pictures=true", *more])
+        fit(
+            [
+                "--config",
+                str(toy / "tiny.yaml"),
+                f"--data.root={toy}",
+                f"--out={out}",
+                "--pictures=true",
+                *more,
+            ]
+        )
         return out
 
     return train
 
 
-def test_a_fit_and_a_validation_leave_their_pictures(toy: Path, trained: Callable[..., Path]) -> None:
+def test_a_fit_and_a_validation_leave_their_pictures(
+    toy: Path, trained: Callable[..., Path]
+) -> None:
     run = trained("run")
-    folders = {run / "pictures": {*VALIDATION, "losses.png", "last"}, run / "pictures" / "last": VALIDATION}
-    assert main(["validate", str(run / "best.ckpt"), str(toy), "--workers=0", f"--pictures={toy / 'new' / 'p'}"]) == 0
+    folders = {
+        run / "pictures": {*VALIDATION, "losses.png", "last"},
+        run / "pictures" / "last": VALIDATION,
+    }
+    assert (
+        main(
+            [
+                "validate",
+                str(run / "best.ckpt"),
+                str(toy),
+                "--workers=0",
+                f"--pictures={toy / 'new' / 'p'}",
+            ]
+        )
+        == 0
+    )
     folders[toy / "new" / "p"] = VALIDATION
     for folder, names in folders.items():
         assert {path.name for path in folder.iterdir()} - {MANIFEST} == names
@@ -209,8 +272,14 @@ def test_the_best_validations_pictures_stay_and_the_last_ones_are_beside_them(
 
     monkeypatch.setattr(pictures, "draw_validation", draw)
     # at this rate no epoch scores better than the first; Lightning's trial validation is not drawn
-    folder = trained("standstill", "--trainer.max_epochs=2", "--model.optimizer.lr=1e-12", *SHORT) / "pictures"
-    assert [(folder / name).read_text() for name in ("picture.txt", "last/picture.txt")] == ["0", "1"]
+    folder = (
+        trained("standstill", "--trainer.max_epochs=2", "--model.optimizer.lr=1e-12", *SHORT)
+        / "pictures"
+    )
+    assert [(folder / name).read_text() for name in ("picture.txt", "last/picture.txt")] == [
+        "0",
+        "1",
+    ]
 
 
 def test_what_cannot_be_drawn_is_told_and_the_training_goes_on(

@@ -1,4 +1,6 @@
-"""Run lengths made of windows against pycocotools' of whole masks, and boundaries against faster-coco-eval's."""
+"""Run lengths made of windows against pycocotools' of whole masks, and boundaries against
+faster-coco-eval's.
+"""
 
 import cv2
 import numpy as np
@@ -22,8 +24,13 @@ def whole_rle(mask: NDArray[np.bool_]) -> dict[str, object]:
 def random_window(seed: int) -> tuple[NDArray[np.bool_], int, int]:
     """Noise of any density, often with full columns, as high or as wide as the image, or empty."""
     rng = np.random.default_rng(seed)
-    height, width = (int(side) if rng.random() < 0.2 else int(rng.integers(0, side + 1)) for side in SIZE)
-    top, left = int(rng.integers(0, SIZE[0] - height + 1)), int(rng.integers(0, SIZE[1] - width + 1))
+    height, width = (
+        int(side) if rng.random() < 0.2 else int(rng.integers(0, side + 1)) for side in SIZE
+    )
+    top, left = (
+        int(rng.integers(0, SIZE[0] - height + 1)),
+        int(rng.integers(0, SIZE[1] - width + 1)),
+    )
     window = rng.random((height, width)) < rng.choice([0, 0.1, 0.5, 0.95, 1])
     window[:, rng.random(width) < 0.2] = True
     return window, top, left
@@ -45,7 +52,10 @@ def test_boundaries_are_those_of_faster_coco_eval(seed: int) -> None:
     rng = np.random.default_rng(seed)
     canvas = np.zeros(SIZE, np.uint8)
     for _ in range(int(rng.integers(1, 4))):
-        centre, axes = (int(rng.integers(0, 80)), int(rng.integers(0, 60))), (int(rng.integers(1, 40)), 9)
+        centre, axes = (
+            (int(rng.integers(0, 80)), int(rng.integers(0, 60))),
+            (int(rng.integers(1, 40)), 9),
+        )
         cv2.ellipse(canvas, centre, axes, float(rng.integers(0, 180)), 0, 360, 1, -1)
     shape = whole_rle(canvas.astype(np.bool_))
     expected = theirs.decode(theirs.rleToBoundary(shape))
@@ -60,7 +70,9 @@ def test_polygons_have_boundaries_too() -> None:
     square = [[10, 10, 40, 10, 40, 40, 10, 40]]
     inside = theirs.decode(to_rle(square, SIZE)).sum()
     assert inside == 900
-    assert theirs.decode(boundary_rle(square, SIZE)).sum() == 900 - 26 * 26  # 2 % of the diagonal are 2 px
+    assert (
+        theirs.decode(boundary_rle(square, SIZE)).sum() == 900 - 26 * 26
+    )  # 2 % of the diagonal are 2 px
 
 
 def test_an_empty_mask_has_an_empty_boundary() -> None:

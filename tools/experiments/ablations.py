@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Ablations of the network: HDC's rates on the same weights, and the CQE head's fusions, targets and uses.
+"""Ablations of the network: HDC's rates on the same weights, and the CQE head's fusions, targets
+and uses.
 
     tools/experiments/ablations.py hdc --data ROOT [ROOT ...] --out DIR [--seeds 0 1 2] [--jobs 2]
         [-- OPTIONS OF cohdc fit]
     tools/experiments/ablations.py cqe --data ROOT [ROOT ...] --out DIR ...
 
-The first ROOT's val split is scored. Every variant has the same data, seeds and budget. Writes STUDY.md and STUDY.json
-to DIR; a second call goes on where the first was stopped.
+The first ROOT's val split is scored. Every variant has the same data, seeds and budget. Writes
+STUDY.md and STUDY.json to DIR; a second call goes on where the first was stopped.
 """
 
 import argparse
@@ -16,9 +17,15 @@ from pathlib import Path
 
 from training_runs import Run, run_all, spread, table
 
-RATES = {"(1, 1, 1)": "[1]", "(1, 2, 3)": "[1,2,3]", "(1, 2, 5)": "[1,2,5]"}  # of the two deep stages
+RATES = {
+    "(1, 1, 1)": "[1]",
+    "(1, 2, 3)": "[1,2,3]",
+    "(1, 2, 5)": "[1,2,5]",
+}  # of the two deep stages
 HDC = {
-    name: (f"--model.network.rates=[[1],[1],{rates},{rates}]",)  # the stages nearest to ImageNet's features keep theirs
+    name: (
+        f"--model.network.rates=[[1],[1],{rates},{rates}]",
+    )  # the stages nearest to ImageNet's features keep theirs
     for name, rates in RATES.items()
 }
 CQE = {
@@ -52,7 +59,9 @@ SCORES = (
 def main() -> None:
     """Train, score, print."""
     own, _, fit = " ".join(sys.argv[1:]).partition(" -- ")
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("study", choices=["hdc", "cqe"])
     parser.add_argument("--data", type=Path, nargs="+", required=True)
     parser.add_argument("--out", type=Path, required=True)
@@ -62,7 +71,8 @@ def main() -> None:
     variants = HDC if arguments.study == "hdc" else CQE
     runs = {
         (name, seed): Run(
-            arguments.out / f"{arguments.study}_{name}_seed{seed}".replace(" ", "").replace(",", "-"),
+            arguments.out
+            / f"{arguments.study}_{name}_seed{seed}".replace(" ", "").replace(",", "-"),
             tuple(root.resolve() for root in arguments.data),
             (*options, f"--seed_everything={seed}", *fit.split()),
             PLAIN if arguments.study == "hdc" or name == "off" else USES,
@@ -76,7 +86,8 @@ def main() -> None:
         for use in results[name, arguments.seeds[0]]:
             scores = [results[name, seed][use] for seed in arguments.seeds]
             kept += [
-                {"variant": name, "use": use, "seed": s, **r} for s, r in zip(arguments.seeds, scores, strict=True)
+                {"variant": name, "use": use, "seed": s, **r}
+                for s, r in zip(arguments.seeds, scores, strict=True)
             ]
             rows.append([name, use, *(spread([one[score] for one in scores]) for score in SCORES)])
     text = table(["variant", "masks ranked", *SCORES], rows)

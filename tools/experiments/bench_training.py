@@ -1,14 +1,17 @@
 #!/usr/bin/env python3
-"""Training and validation of this project against plain torchvision and pycocotools loops, paired on one machine.
+"""Training and validation of this project against plain torchvision and pycocotools loops, paired
+on one machine.
 
-    tools/experiments/bench_training.py --data ROOT [--classes person] [--canvas 320 416] [--threads 1]
+    tools/experiments/bench_training.py --data ROOT [--classes person] [--canvas 320 416] [--threads
+    1]
         [--blocks 8] [--out FILE.json]
 
-Both sides train the same ResNet-18 Mask R-CNN from the same weights on the same images in the same order; ours has its
-CQE head besides. The reference does what torchvision's detection training does: CocoDetection, polygons to masks,
-horizontal flip, resizing inside the model, SGD, float32; and validates by pasting masks, pycocotools' encoding and
-COCOeval of boxes and masks. Each side has a process of its own; blocks alternate, so that whatever else runs on the
-machine hits both. Validation needs a checkpoint, or finds next to nothing to paste: --checkpoint best.ckpt; the phase
+Both sides train the same ResNet-18 Mask R-CNN from the same weights on the same images in the same
+order; ours has its CQE head besides. The reference does what torchvision's detection training does:
+CocoDetection, polygons to masks, horizontal flip, resizing inside the model, SGD, float32; and
+validates by pasting masks, pycocotools' encoding and COCOeval of boxes and masks. Each side has a
+process of its own; blocks alternate, so that whatever else runs on the machine hits both.
+Validation needs a checkpoint, or finds next to nothing to paste: --checkpoint best.ckpt; the phase
 `file` validates its exported file instead: --onnx model.onnx.
 """
 
@@ -26,7 +29,9 @@ SIDES = ("ours", "reference")
 
 
 class Gate:
-    """The worker's end of the pipe: `next` says how long the block took and waits for the word to go on."""
+    """The worker's end of the pipe: `next` says how long the block took and waits for the word to
+    go on.
+    """
 
     def __init__(self, pipe: Connection) -> None:
         self.pipe = pipe
@@ -43,22 +48,45 @@ class Gate:
 
 
 def options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, required=True, help="COCO-format folder")
     parser.add_argument("--classes", nargs="*", help="these classes only")
-    parser.add_argument("--canvas", type=int, nargs=2, default=(320, 416), metavar=("H", "W"), help="px, of both sides")
-    parser.add_argument("--network", help="YAML file of both sides' network, such as networks/hdc_net_n.yaml")
-    parser.add_argument("--weights", help="ImageNet weights of both backbones: a torchvision name or a file")
-    parser.add_argument("--checkpoint", type=Path, help="weights of both sides in validation, by cohdc fit")
-    parser.add_argument("--onnx", type=Path, help="the checkpoint's file, by cohdc export, for the phase `file`")
+    parser.add_argument(
+        "--canvas",
+        type=int,
+        nargs=2,
+        default=(320, 416),
+        metavar=("H", "W"),
+        help="px, of both sides",
+    )
+    parser.add_argument(
+        "--network", help="YAML file of both sides' network, such as networks/hdc_net_n.yaml"
+    )
+    parser.add_argument(
+        "--weights", help="ImageNet weights of both backbones: a torchvision name or a file"
+    )
+    parser.add_argument(
+        "--checkpoint", type=Path, help="weights of both sides in validation, by cohdc fit"
+    )
+    parser.add_argument(
+        "--onnx", type=Path, help="the checkpoint's file, by cohdc export, for the phase `file`"
+    )
     parser.add_argument("--threads", type=int, default=1, help="of each side")
-    parser.add_argument("--blocks", type=int, default=8, help="timed blocks of each side, after one that is not")
+    parser.add_argument(
+        "--blocks", type=int, default=8, help="timed blocks of each side, after one that is not"
+    )
     parser.add_argument("--steps", type=int, default=8, help="training steps per block")
     parser.add_argument("--batch", type=int, default=2, help="training images per step")
     parser.add_argument("--val-images", type=int, default=20, help="validation images per block")
-    parser.add_argument("--phases", nargs="*", choices=("train", "val", "file"), default=("train", "val"))
+    parser.add_argument(
+        "--phases", nargs="*", choices=("train", "val", "file"), default=("train", "val")
+    )
     parser.add_argument("--precision", default="bf16-mixed", help="ours; the reference is float32")
-    parser.add_argument("--augment", choices=("flip", "full"), default="flip", help="ours; the reference flips")
+    parser.add_argument(
+        "--augment", choices=("flip", "full"), default="flip", help="ours; the reference flips"
+    )
     parser.add_argument("--cqe", default="concat", help="ours; 'off' leaves the head out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
@@ -76,12 +104,29 @@ def network_config(args: argparse.Namespace) -> Any:
     from cohdc_train.presets import config_path
 
     if args.network:
-        fields = yaml.safe_load(config_path(args.network).read_text(encoding="utf-8"))["model"]["network"]
-        own = {"weights": args.weights, "norm": "frozen", "frozen_stages": 2, "canvas": tuple(args.canvas)}
+        fields = yaml.safe_load(config_path(args.network).read_text(encoding="utf-8"))["model"][
+            "network"
+        ]
+        own = {
+            "weights": args.weights,
+            "norm": "frozen",
+            "frozen_stages": 2,
+            "canvas": tuple(args.canvas),
+        }
         return NetworkConfig(**{**fields, **own, "cqe": args.cqe})
     return NetworkConfig(
-        **{"depth": 18, "rates": ((1,), (1,), (1, 2, 3), (1, 2, 3)), "weights": args.weights, "norm": "frozen"},
-        **{"frozen_stages": 2, "canvas": tuple(args.canvas), "anchor_scales": (16, 32, 64, 128, 256), "cqe": args.cqe},
+        **{
+            "depth": 18,
+            "rates": ((1,), (1,), (1, 2, 3), (1, 2, 3)),
+            "weights": args.weights,
+            "norm": "frozen",
+        },
+        **{
+            "frozen_stages": 2,
+            "canvas": tuple(args.canvas),
+            "anchor_scales": (16, 32, 64, 128, 256),
+            "cqe": args.cqe,
+        },
         **{"fpn_channels": 64, "fc": 512, "proposals": (500, 200), "rois": 64, "detections": 32},
     )
 
@@ -111,16 +156,19 @@ def built(args: argparse.Namespace, checkpoint: Path | None = None) -> tuple[Any
 
 
 def order(args: argparse.Namespace, data: Any) -> list[int]:
-    """Positions of the training images that have objects, in the order in which both sides see them."""
+    """Positions of the training images that have objects, in the order in which both sides see
+    them.
+    """
     import numpy as np
 
     images = data.folder.train[0].images
     usable = [i for i, image in enumerate(images) if any(not o.crowd for o in image.objects)]
     wanted = (args.blocks + 1) * args.steps * args.batch
     rng = np.random.default_rng(args.seed)
-    return [int(i) for i in np.concatenate([rng.permutation(usable) for _ in range(wanted // len(usable) + 1)])][
-        :wanted
-    ]
+    return [
+        int(i)
+        for i in np.concatenate([rng.permutation(usable) for _ in range(wanted // len(usable) + 1)])
+    ][:wanted]
 
 
 def train_ours(args: argparse.Namespace, gate: Gate) -> None:
@@ -138,12 +186,20 @@ def train_ours(args: argparse.Namespace, gate: Gate) -> None:
         def on_train_start(self, trainer: Any, pl_module: Any) -> None:
             gate.next()
 
-        def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        def on_train_batch_end(
+            self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+        ) -> None:
             if (batch_idx + 1) % args.steps == 0:
                 gate.next()
 
     trainer = pl.Trainer(
-        **{"accelerator": "cpu", "precision": args.precision, "max_epochs": 1, "limit_val_batches": 0, "logger": False},
+        **{
+            "accelerator": "cpu",
+            "precision": args.precision,
+            "max_epochs": 1,
+            "limit_val_batches": 0,
+            "logger": False,
+        },
         **{"callbacks": [Blocks()], "enable_checkpointing": False, "enable_progress_bar": False},
         **{"enable_model_summary": False, "gradient_clip_val": 5.0},
     )
@@ -171,15 +227,24 @@ def validate_ours(args: argparse.Namespace, gate: Gate) -> None:
 
     module, data = built(args, args.checkpoint)
     whole = data.val_dataloader()
-    loader = DataLoader(Subset(whole.dataset, range(args.val_images)), args.batch, collate_fn=whole.collate_fn)
+    loader = DataLoader(
+        Subset(whole.dataset, range(args.val_images)), args.batch, collate_fn=whole.collate_fn
+    )
     data.val_dataloader = lambda: loader
     trainer = pl.Trainer(
-        **{"accelerator": "cpu", "precision": args.precision, "logger": False, "enable_checkpointing": False},
+        **{
+            "accelerator": "cpu",
+            "precision": args.precision,
+            "logger": False,
+            "enable_checkpointing": False,
+        },
         **{"enable_progress_bar": False, "enable_model_summary": False},
     )
     while gate.next():
         (scores,) = trainer.validate(module, datamodule=data, verbose=False)
-    print(f"ours: segm AP {scores['val/segm_AP']:.3f}, box AP {scores['val/box_AP']:.3f}", flush=True)
+    print(
+        f"ours: segm AP {scores['val/segm_AP']:.3f}, box AP {scores['val/box_AP']:.3f}", flush=True
+    )
 
 
 def validate_file(args: argparse.Namespace, gate: Gate) -> None:
@@ -198,7 +263,9 @@ def validate_file(args: argparse.Namespace, gate: Gate) -> None:
 
 
 def mebibytes(line: str) -> int:
-    """Resident memory of this process: VmRSS now, VmHWM its peak (ru_maxrss would count the parent's too)."""
+    """Resident memory of this process: VmRSS now, VmHWM its peak (ru_maxrss would count the
+    parent's too).
+    """
     status = Path("/proc/self/status").read_text(encoding="utf-8")
     return int(status.partition(f"{line}:")[2].split()[0]) // 1024
 
@@ -248,15 +315,25 @@ def measure(phase: str, args: argparse.Namespace) -> dict[str, Any]:
     images = args.steps * args.batch if phase == "train" else args.val_images
     rate = {side: [images / s for s in seconds[side][1:]] for side in SIDES}
     ratios = [ours / theirs for ours, theirs in zip(rate["ours"], rate["reference"], strict=True)]
-    return {"images_per_s": rate, "ratios": ratios, "mib_before_and_peak": {side: pipes[side].recv() for side in SIDES}}
+    return {
+        "images_per_s": rate,
+        "ratios": ratios,
+        "mib_before_and_peak": {side: pipes[side].recv() for side in SIDES},
+    }
 
 
 def report(phase: str, found: dict[str, Any]) -> str:
-    rates = ", ".join(f"{side} {statistics.median(found['images_per_s'][side]):.2f} images/s" for side in SIDES)
-    memory = ", ".join("{} {}, before {}".format(side, *found["mib_before_and_peak"][side][::-1]) for side in SIDES)
+    rates = ", ".join(
+        f"{side} {statistics.median(found['images_per_s'][side]):.2f} images/s" for side in SIDES
+    )
+    memory = ", ".join(
+        "{} {}, before {}".format(side, *found["mib_before_and_peak"][side][::-1]) for side in SIDES
+    )
     ratios = sorted(found["ratios"])
     quartiles = statistics.quantiles(ratios, n=4) if len(ratios) > 1 else ratios * 3
-    spread = f"quartiles {quartiles[0]:.2f}-{quartiles[2]:.2f}, range {ratios[0]:.2f}-{ratios[-1]:.2f}"
+    spread = (
+        f"quartiles {quartiles[0]:.2f}-{quartiles[2]:.2f}, range {ratios[0]:.2f}-{ratios[-1]:.2f}"
+    )
     return f"{phase}: {rates}; ratio {statistics.median(ratios):.2f} ({spread}); peak MiB {memory}"
 
 
@@ -268,7 +345,9 @@ def main() -> int:
         found[phase] = measure(phase, args)
         print(report(phase, found[phase]), flush=True)
     if args.out is not None:
-        args.out.write_text(json.dumps({"options": vars(args), **found}, indent=1, default=str), encoding="utf-8")
+        args.out.write_text(
+            json.dumps({"options": vars(args), **found}, indent=1, default=str), encoding="utf-8"
+        )
     return 0
 
 

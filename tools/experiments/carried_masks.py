@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""How well a true mask is carried on by flow and depth, against the true mask of the frame where it arrives.
+"""How well a true mask is carried on by flow and depth, against the true mask of the frame where it
+arrives.
 
     tools/experiments/carried_masks.py --sequences SEQUENCE ... --out OUT [--steps 1 3 6 10]
 
-Every --every-th frame's mask, of the TUM-format sequence's folder `masks`, is carried on through those that follow,
-where there is anybody in it.
-OUT/carried_masks.md has the means, OUT/carried_masks.json the same: IoU, share of the people's pixels that are covered,
-share of all others that are.
+Every --every-th frame's mask, of the TUM-format sequence's folder `masks`, is carried on through
+those that follow, where there is anybody in it.
+OUT/carried_masks.md has the means, OUT/carried_masks.json the same: IoU, share of the people's
+pixels that are covered, share of all others that are.
 """
 
 import argparse
@@ -26,10 +27,15 @@ from cohdc_train.slam.io.sources import Recorded
 
 
 def halves(folder: Path) -> list[tuple[Half, Mask]]:
-    """All frames of a sequence at half size, and their true masks. Raises DataError for what cannot be used."""
+    """All frames of a sequence at half size, and their true masks. Raises DataError for what cannot
+    be used.
+    """
     camera = choose_camera(folder, None)[0]
     masks = MaskFolder(folder / "masks", camera, Culling())
-    return [(halve(view.rgb, view.depth), halve_mask(masks.outline(view)[0])) for view in Recorded(folder, camera)]
+    return [
+        (halve(view.rgb, view.depth), halve_mask(masks.outline(view)[0]))
+        for view in Recorded(folder, camera)
+    ]
 
 
 def carried_on(frames: list[tuple[Half, Mask]]) -> list[Mask]:
@@ -49,7 +55,11 @@ def carried_on(frames: list[tuple[Half, Mask]]) -> list[Mask]:
 def likeness(mask: Mask, truth: Mask) -> tuple[float, float, float]:
     """IoU, share of the truth that is covered, share of the rest that is."""
     both, either, people = (np.count_nonzero(part) for part in (mask & truth, mask | truth, truth))
-    return both / max(either, 1), both / max(people, 1), (either - people) / max(truth.size - people, 1)
+    return (
+        both / max(either, 1),
+        both / max(people, 1),
+        (either - people) / max(truth.size - people, 1),
+    )
 
 
 def measured(folder: Path, steps: list[int], every: int) -> list[dict[str, Any]]:
@@ -57,7 +67,9 @@ def measured(folder: Path, steps: list[int], every: int) -> list[dict[str, Any]]
     frames, last = halves(folder), max(steps)
     starts = [start for start in range(0, len(frames) - last, every) if frames[start][1].any()]
     if not starts:
-        raise DataError(f"{folder}: of {len(frames)} frames none with anybody in it has {last} after it")
+        raise DataError(
+            f"{folder}: of {len(frames)} frames none with anybody in it has {last} after it"
+        )
     found = []
     for start in starts:
         masks = carried_on(frames[start : start + last + 1])
@@ -71,16 +83,25 @@ def measured(folder: Path, steps: list[int], every: int) -> list[dict[str, Any]]
 
 def main() -> None:
     """Run, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sequences", type=Path, nargs="+", required=True, metavar="SEQUENCE")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, nargs="+", default=[1, 3, 6, 10], help="frames, 1 or more")
+    parser.add_argument(
+        "--steps", type=int, nargs="+", default=[1, 3, 6, 10], help="frames, 1 or more"
+    )
     parser.add_argument("--every", type=int, default=4, help="frames from one start to the next")
     arguments = parser.parse_args()
     if min(*arguments.steps, arguments.every) < 1:
-        raise SystemExit(f"--steps and --every must be 1 or more, not {min(*arguments.steps, arguments.every)}")
+        raise SystemExit(
+            f"--steps and --every must be 1 or more, not {min(*arguments.steps, arguments.every)}"
+        )
     arguments.out.mkdir(parents=True, exist_ok=True)
-    rows, lines = [], ["| sequence | frames | IoU | people covered | others covered |", "|---|---|---|---|---|"]
+    rows, lines = (
+        [],
+        ["| sequence | frames | IoU | people covered | others covered |", "|---|---|---|---|---|"],
+    )
     for folder in arguments.sequences:
         try:
             rows += measured(folder, arguments.steps, arguments.every)

@@ -4,9 +4,10 @@
     tools/experiments/contours.py --out DIR [--data NAME=COCO_FOLDER ...]
         [--model FILE --photos FOLDER] [--count 300] [--seed 0]
 
-Sources: people that `cohdc synth` renders, the annotated objects of every COCO folder, and the masks that a model finds
-in a folder's images. `count` of each are drawn by the seed among those of at least 400 px. `dp` has one tolerance per
-source and floor, at which its mean IoU is that of bas_dp. Writes contours.json, contours.md and contours.png to DIR.
+Sources: people that `cohdc synth` renders, the annotated objects of every COCO folder, and the
+masks that a model finds in a folder's images. `count` of each are drawn by the seed among those of
+at least 400 px. `dp` has one tolerance per source and floor, at which its mean IoU is that of
+bas_dp. Writes contours.json, contours.md and contours.png to DIR.
 """
 
 import argparse
@@ -36,7 +37,9 @@ LEAST_AREA = 400  # px
 
 def main() -> None:
     """Draw masks, simplify them, write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", nargs="*", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--model", type=Path)
@@ -54,7 +57,10 @@ def main() -> None:
         if not masks:
             continue
         outlines = [trace(mask) for mask in masks]
-        print(f"{source}: {len(masks)} contours, {np.mean([vertices(o) for o in outlines]):.0f} vertices", flush=True)
+        print(
+            f"{source}: {len(masks)} contours, {np.mean([vertices(o) for o in outlines]):.0f} vertices",
+            flush=True,
+        )
         rows.append(measured("trace", source, 1.0, masks, outlines, [0.0]))
         for floor in FLOORS:
             for method in METHODS:
@@ -71,7 +77,13 @@ def sources(arguments: argparse.Namespace) -> Iterator[tuple[str, list[np.ndarra
     """(name, masks) of each source; crowds are left out."""
     rng = np.random.default_rng(arguments.seed)
     with tempfile.TemporaryDirectory() as folder:
-        coco(Path(folder) / "synth", train=arguments.count, val=1, size=(480, 640), seed=arguments.seed)
+        coco(
+            Path(folder) / "synth",
+            train=arguments.count,
+            val=1,
+            size=(480, 640),
+            seed=arguments.seed,
+        )
         yield "synthetic", annotated(Path(folder) / "synth", arguments.count, rng)
     for entry in arguments.data:
         name, _, root = entry.partition("=")
@@ -81,7 +93,11 @@ def sources(arguments: argparse.Namespace) -> Iterator[tuple[str, list[np.ndarra
         masks: list[np.ndarray] = []
         for picture in read_pictures(arguments.photos):
             found = network(picture.rgb)
-            masks += [mask for mask in found.select(found.scores >= 0.5).masks() if mask.sum() >= LEAST_AREA]
+            masks += [
+                mask
+                for mask in found.select(found.scores >= 0.5).masks()
+                if mask.sum() >= LEAST_AREA
+            ]
             if len(masks) >= arguments.count:
                 break
         yield "segmenter", masks[: arguments.count]
@@ -136,8 +152,15 @@ def measured(
     edges = []
     for mask, outline in zip(masks, outlines, strict=True):
         filled = rasterize(outline, mask.shape)
-        edges.append(float(boundary_iou(torch.from_numpy(filled), torch.from_numpy(mask), band_of(*mask.shape))))
-    texts = [json.dumps([p.keyhole().ravel().round(1).tolist() for p in o], separators=(",", ":")) for o in outlines]
+        edges.append(
+            float(
+                boundary_iou(torch.from_numpy(filled), torch.from_numpy(mask), band_of(*mask.shape))
+            )
+        )
+    texts = [
+        json.dumps([p.keyhole().ravel().round(1).tolist() for p in o], separators=(",", ":"))
+        for o in outlines
+    ]
     return {
         "method": method,
         "source": source,
@@ -161,7 +184,9 @@ def fixed_tolerance(
     for _ in range(9):
         middle = (low * high) ** 0.5
         simpler, taken = simplified(outlines, floor, "dp", middle)
-        low, high = (middle, high) if statistics.fmean(ious(masks, simpler)) >= mean else (low, middle)
+        low, high = (
+            (middle, high) if statistics.fmean(ious(masks, simpler)) >= mean else (low, middle)
+        )
     simpler, taken = simplified(outlines, floor, "dp", low)
     return measured("dp", source, floor, masks, simpler, taken) | {"epsilon": low}
 
@@ -171,9 +196,22 @@ def table(rows: list[dict]) -> str:
     text = "| source | floor | method | vertices | of bisection | of dp | IoU mean | IoU least | Boundary IoU | "
     text += "ms median | ms p95 | bytes |\n" + "|---" * 12 + "|\n"
     for row in rows:
-        rest = {r["method"]: r for r in rows if (r["source"], r["iou_floor"]) == (row["source"], row["iou_floor"])}
-        shares = [f"{row['vertices'] / rest[m]['vertices']:.2f}" if m in rest else "" for m in ("bisection", "dp")]
-        cells = [row["source"], f"{row['iou_floor']:.2f}", row["method"], f"{row['vertices']:.1f}", *shares]
+        rest = {
+            r["method"]: r
+            for r in rows
+            if (r["source"], r["iou_floor"]) == (row["source"], row["iou_floor"])
+        }
+        shares = [
+            f"{row['vertices'] / rest[m]['vertices']:.2f}" if m in rest else ""
+            for m in ("bisection", "dp")
+        ]
+        cells = [
+            row["source"],
+            f"{row['iou_floor']:.2f}",
+            row["method"],
+            f"{row['vertices']:.1f}",
+            *shares,
+        ]
         cells += [f"{row[key]:.3f}" for key in ("iou_mean", "iou_min", "boundary_iou")]
         cells += [f"{row[key]:.2f}" for key in ("ms", "ms_p95")] + [f"{row['bytes']:.0f}"]
         text += "| " + " | ".join(cells) + " |\n"
@@ -191,7 +229,11 @@ def plot(rows: list[dict]) -> bytes:
     figure = Figure(figsize=(4 * len(names), 3.6), layout="constrained")
     for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
         for method in ("dp", *METHODS):
-            points = [(r["iou_mean"], r["vertices"]) for r in rows if (r["source"], r["method"]) == (name, method)]
+            points = [
+                (r["iou_mean"], r["vertices"])
+                for r in rows
+                if (r["source"], r["method"]) == (name, method)
+            ]
             axes.plot(*zip(*points, strict=True), "o-", label=method)
         axes.set(title=name, xlabel="mean IoU", ylabel="vertices", yscale="log")
         axes.yaxis.set_major_formatter("{x:g}")

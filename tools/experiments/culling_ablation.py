@@ -1,13 +1,15 @@
 #!/usr/bin/env python3
-"""What CQE's quality is worth to SLAM: bands of doubt by quality, bands alike, and the paper's filter at 0.9.
+"""What CQE's quality is worth to SLAM: bands of doubt by quality, bands alike, and the paper's
+filter at 0.9.
 
     tools/experiments/culling_ablation.py --sequences DIR [DIR ...] --out OUT [--model person]
         [--seeds 0 1 2] [--method KEY=VALUE ...]
 
-The model segments every frame once; the masks that each way of culling makes of that are written as PNGs, and
-`cohdc slam` runs on them. The bands that are alike are as wide as those by quality are on average. A sequence has true
-masks in `masks/`: "covered" is the share of the people's pixels that a way culls, "lost" that of all others. Every
-row goes into OUT/culling.json as soon as it is there, the medians and worst of the seeds into OUT/culling.md.
+The model segments every frame once; the masks that each way of culling makes of that are written as
+PNGs, and `cohdc slam` runs on them. The bands that are alike are as wide as those by quality are on
+average. A sequence has true masks in `masks/`: "covered" is the share of the people's pixels that a
+way culls, "lost" that of all others. Every row goes into OUT/culling.json as soon as it is there,
+the medians and worst of the seeds into OUT/culling.md.
 """
 
 import argparse
@@ -51,7 +53,11 @@ def main() -> None:
             row = {"sequence": sequence.name, "way": way}
             row |= write_masks(folder / "masks", found, truth, labels, culling)
             for seed in arguments.seeds:
-                given = {"masks": folder / "masks", "culling": Culling(dilate=0), "method": arguments.method}
+                given = {
+                    "masks": folder / "masks",
+                    "culling": Culling(dilate=0),
+                    "method": arguments.method,
+                }
                 metrics = slam(sequence=sequence, out=folder / f"seed{seed}", seed=seed, **given)
                 ate = metrics.get("ate_m", {}).get("rmse")
                 rows.append(row | {"seed": seed, "ate_m": ate, "coverage": metrics["coverage"]})
@@ -62,10 +68,16 @@ def main() -> None:
 
 def parse() -> argparse.Namespace:
     """The arguments; `method` is a Method."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", type=Path, nargs="+", required=True, help="TUM-format folders with masks/")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--sequences", type=Path, nargs="+", required=True, help="TUM-format folders with masks/"
+    )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--model", type=Path, default=Path("person"), help="ONNX or a shipped network's name")
+    parser.add_argument(
+        "--model", type=Path, default=Path("person"), help="ONNX or a shipped network's name"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     add_method_option(parser)
     arguments = parser.parse_args()
@@ -101,11 +113,17 @@ def write_masks(
         cv2.imwrite(str(folder / f"{name}.png"), mask.astype(np.uint8) * 255)
         covered, people = covered + int((mask & truth[name]).sum()), people + int(truth[name].sum())
         lost, others = lost + int((mask & ~truth[name]).sum()), others + int((~truth[name]).sum())
-    return {"covered": covered / max(people, 1), "lost": lost / max(others, 1), "dilate": culling.dilate}
+    return {
+        "covered": covered / max(people, 1),
+        "lost": lost / max(others, 1),
+        "dilate": culling.dilate,
+    }
 
 
 def table(rows: list[Row]) -> str:
-    """ATE RMSE m, median (worst) over the seeds, with least coverage, and what the masks cover and lose."""
+    """ATE RMSE m, median (worst) over the seeds, with least coverage, and what the masks cover and
+    lose.
+    """
     lines = [
         "| sequence | culling | people covered | others lost | ATE RMSE, m | frames |",
         "|---|---|---|---|---|---|",

@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""Size and speed of network designs before any is trained: random weights, one class, from image to masks.
+"""Size and speed of network designs before any is trained: random weights, one class, from image to
+masks.
 
-    tools/experiments/designs.py --out DIR [--designs R50 n ...] [--canvas 480 640] [--threads 1] [--pictures 6]
+    tools/experiments/designs.py --out DIR [--designs R50 n ...] [--canvas 480 640] [--threads 1]
+    [--pictures 6]
 
-Every design is written as ONNX, in float32 and int8, and all files take turns on the same pictures. A random network
-finds as many objects as its padding holds, so that the time is that of a full picture. Times are shares of the first
-design's in float32. Writes designs.md and designs.json to DIR.
+Every design is written as ONNX, in float32 and int8, and all files take turns on the same pictures.
+A random network finds as many objects as its padding holds, so that the time is that of a full
+picture. Times are shares of the first design's in float32. Writes designs.md and designs.json to
+DIR.
 """
 
 import argparse
@@ -41,8 +44,22 @@ DESIGNS = {
     "R34 HDC": {"depth": 34, "rates": HDC},
     "R50 slim": {"rates": PLAIN, **SLIM},
     "R34 HDC FPN128 slim": {"depth": 34, "rates": HDC, "fpn_channels": 128, "fc": 512, **SLIM},
-    "R18 HDC FPN128 slim coarse": {"depth": 18, "rates": HDC, "fpn_channels": 128, "fc": 512, **SLIM, **COARSE},
-    "R18 HDC FPN64 slim coarse": {"depth": 18, "rates": HDC, "fpn_channels": 64, "fc": 256, **SLIM, **COARSE},
+    "R18 HDC FPN128 slim coarse": {
+        "depth": 18,
+        "rates": HDC,
+        "fpn_channels": 128,
+        "fc": 512,
+        **SLIM,
+        **COARSE,
+    },
+    "R18 HDC FPN64 slim coarse": {
+        "depth": 18,
+        "rates": HDC,
+        "fpn_channels": 64,
+        "fc": 256,
+        **SLIM,
+        **COARSE,
+    },
     "MobileNetV1 FPN64 slim coarse": {
         **{"backbone": "mobilenet_v1", "rates": PLAIN, "fpn_channels": 64, "fc": 256},
         **SLIM,
@@ -65,7 +82,9 @@ DESIGNS = {
 
 def main() -> None:
     """Write, quantise, time, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=list(DESIGNS))
     parser.add_argument("--canvas", type=int, nargs=2, default=(480, 640))
@@ -86,7 +105,9 @@ def main() -> None:
         quantize(file, small, pictures[:2])
         costs[name] = count_flops(network)
         files = {"float32": file, "int8": small}
-        runners |= {(name, kind): run for kind, run in runners_of(None, files, arguments.threads).items()}
+        runners |= {
+            (name, kind): run for kind, run in runners_of(None, files, arguments.threads).items()
+        }
         print(f"{name}: {file.stat().st_size / 1e6:.1f} MB", flush=True)
     rates = frame_rates(runners, pictures)
     base = rates[arguments.designs[0], "float32"].median
@@ -105,7 +126,9 @@ def main() -> None:
             }
         )
     write_json(arguments.out / "designs.json", rows)
-    head = "| design | MB | MB int8 | GFLOPs | time float32 | time int8 |\n|---|---|---|---|---|---|\n"
+    head = (
+        "| design | MB | MB int8 | GFLOPs | time float32 | time int8 |\n|---|---|---|---|---|---|\n"
+    )
     lines = [
         f"| {r['design']} | {r['mb']:.1f} | {r['mb_int8']:.1f} | {r['gflops_image']:.1f} | {r['float32']:.3f} "
         f"| {r['int8']:.3f} |"

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
 """What a new user's labelme folder of forty photographs learns in ten minutes on one core.
 
-    tools/experiments/forty_photographs.py --data HUMAN_MATTE --out DIR [--photographs 40] [--minutes 10] [--seed 0]
+    tools/experiments/forty_photographs.py --data HUMAN_MATTE --out DIR [--photographs 40]
+    [--minutes 10] [--seed 0]
 
-Writes DIR/photos as labelme does (train/ with the chosen photographs, val/ with all of the validation split, one JSON
-each), converts it, trains with README's command, and prints the scores of best.ckpt.
+Writes DIR/photos as labelme does (train/ with the chosen photographs, val/ with all of the
+validation split, one JSON each), converts it, trains with README's command, and prints the scores
+of best.ckpt.
 """
 
 import argparse
@@ -19,7 +21,9 @@ from typing import Any
 
 def main() -> int:
     """Write the folder, convert, train, score."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, required=True, help="COCO-format folder with polygons")
     parser.add_argument("--out", type=Path, required=True, help="new folder")
     parser.add_argument("--photographs", type=int, default=40)
@@ -32,13 +36,24 @@ def main() -> int:
     write_labelme(arguments.data, "val", photos / "val", None, arguments.seed)
     cohdc("data", "convert", "labelme", str(photos), str(data))
     budget = (f"--minutes={arguments.minutes:g}", f"--seed_everything={arguments.seed}")
-    cohdc("fit", str(data), *budget, f"--out={run}", "--data.workers=0", "--trainer.enable_progress_bar=false")
-    cohdc("validate", str(run / "best.ckpt"), str(data), "--out", str(arguments.out / "scores.json"))
+    cohdc(
+        "fit",
+        str(data),
+        *budget,
+        f"--out={run}",
+        "--data.workers=0",
+        "--trainer.enable_progress_bar=false",
+    )
+    cohdc(
+        "validate", str(run / "best.ckpt"), str(data), "--out", str(arguments.out / "scores.json")
+    )
     return 0
 
 
 def write_labelme(data: Path, split: str, folder: Path, count: int | None, seed: int) -> None:
-    """Write a split, or `count` of its images, as a labelme folder: links to the images and a JSON beside each."""
+    """Write a split, or `count` of its images, as a labelme folder: links to the images and a JSON
+    beside each.
+    """
     coco = json.loads((data / f"instances_{split}.json").read_text(encoding="utf-8"))
     names = {row["id"]: row["name"] for row in coco["categories"]}
     images = sorted(coco["images"], key=lambda row: row["id"])
@@ -54,15 +69,22 @@ def write_labelme(data: Path, split: str, folder: Path, count: int | None, seed:
             "imageData": None,
             "imageHeight": image["height"],
             "imageWidth": image["width"],
-            "shapes": [shape for number, row in enumerate(rows) for shape in shapes_of(row, names, number)],
+            "shapes": [
+                shape for number, row in enumerate(rows) for shape in shapes_of(row, names, number)
+            ],
         }
-        (folder / source.with_suffix(".json").name).write_text(json.dumps(content), encoding="utf-8")
+        (folder / source.with_suffix(".json").name).write_text(
+            json.dumps(content), encoding="utf-8"
+        )
 
 
 def shapes_of(row: dict[str, Any], names: dict[int, str], number: int) -> list[dict[str, Any]]:
     """Return labelme's shapes of an annotation: a polygon for each part, under one group."""
     shape = {"label": names[row["category_id"]], "shape_type": "polygon", "group_id": number}
-    return [{**shape, "points": list(zip(part[::2], part[1::2], strict=True))} for part in row["segmentation"]]
+    return [
+        {**shape, "points": list(zip(part[::2], part[1::2], strict=True))}
+        for part in row["segmentation"]
+    ]
 
 
 def cohdc(*arguments: str) -> None:

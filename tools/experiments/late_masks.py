@@ -1,13 +1,15 @@
 #!/usr/bin/env python3
-"""What real time costs without a clock: masks that are late by so many frames, and optical flow between matched frames.
+"""What real time costs without a clock: masks that are late by so many frames, and optical flow
+between matched frames.
 
     tools/experiments/late_masks.py --sequences SEQUENCE ... --out OUT [--model person]
         [--late 0 3] [--features 1475 1500 1525]
 
-Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done at once, no frame is dropped, and the
-segmenter always takes --late frames: the same numbers on every machine. `--method flow=false` matches every frame, as
-synchronous runs do. A few corners more or fewer show what is chance. OUT/late_masks.json has every run's ATE RMSE,
-OUT/late_masks.md the means. Without --model masks are those in the sequence's folder `masks`.
+Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done at once, no frame
+is dropped, and the segmenter always takes --late frames: the same numbers on every machine.
+`--method flow=false` matches every frame, as synchronous runs do. A few corners more or fewer show
+what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the means. Without
+--model masks are those in the sequence's folder `masks`.
 """
 
 import argparse
@@ -36,7 +38,9 @@ from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 
 class LateMasks:
-    """Masks as `AsyncMasks` makes them, of a segmenter that takes `late` frames; the first is waited for."""
+    """Masks as `AsyncMasks` makes them, of a segmenter that takes `late` frames; the first is
+    waited for.
+    """
 
     def __init__(self, outline: Outline, late: int) -> None:
         self._outline, self._late = outline, late
@@ -93,18 +97,24 @@ def error(source: Recorded, masks: Callable[[View], Mask], features: int, method
             tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
         tracker.finish()
     assert source.groundtruth is not None
-    rmse: float = score(read_tum(source.groundtruth), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"]
+    rmse: float = score(read_tum(source.groundtruth), Trajectory(*tracker.trajectory()))["ate_m"][
+        "rmse"
+    ]
     return rmse
 
 
 def main() -> None:
     """Run, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sequences", type=Path, nargs="+", required=True, metavar="SEQUENCE")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--model", type=Path, help="ONNX or a shipped network's name")
     parser.add_argument("--late", type=int, nargs="+", default=[0, 3], help="frames")
-    parser.add_argument("--features", type=int, nargs="+", default=[1475, 1500, 1525], help="corners a frame")
+    parser.add_argument(
+        "--features", type=int, nargs="+", default=[1475, 1500, 1525], help="corners a frame"
+    )
     add_method_option(parser)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -116,11 +126,17 @@ def main() -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """What there is so far is written after every line."""
-    rows, lines = [], ["| sequence | late by frames | mean ATE RMSE, m | each |", "|---|---|---|---|"]
+    rows, lines = (
+        [],
+        ["| sequence | late by frames | mean ATE RMSE, m | each |", "|---|---|---|---|"],
+    )
     for folder in arguments.sequences:
         source, outline = opened(folder, arguments.model)
         for late in arguments.late:
-            errors = [error(source, LateMasks(outline, late), n, arguments.method) for n in arguments.features]
+            errors = [
+                error(source, LateMasks(outline, late), n, arguments.method)
+                for n in arguments.features
+            ]
             rows += [
                 {"sequence": folder.name, "late": late, "features": n, "ate_m": e}
                 for n, e in zip(arguments.features, errors, strict=True)

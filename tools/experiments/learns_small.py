@@ -1,22 +1,27 @@
 #!/usr/bin/env python3
-"""What `cohdc fit` learns on small real sets in minutes, against torchvision's recipe on the same network.
+"""What `cohdc fit` learns on small real sets in minutes, against torchvision's recipe on the same
+network.
 
     tools/experiments/learns_small.py --data SET [SET ...] --imagenet mobilenet_v2.pth --out DIR
         [--minutes 6 60] [--seeds 0 1 2] [--precision 32-true]
 
-Two contenders train at a time, each in a process of its own with one thread, on a core of its own, by the clock:
+Two contenders train at a time, each in a process of its own with one thread, on a core of its own,
+by the clock:
 
-    shipped         cohdc fit SET --minutes M                       (README's command: starts from the shipped weights)
-    imagenet        the same with --pretrained mobilenet_v2.pth
-    torchvision-LR  torchvision's references/detection recipe, written in reference_loops.py: SGD .9, weight decay
-                    1e-4, frozen norms and first two parts, horizontal flip, warm-up of its first epoch (at most 1000
-                    steps), rate divided by ten at 16/26 and 22/26 of the budget; the same ImageNet weights and canvas
-    torchvision-LR-short   the same with a warm-up of 5 % of the budget: its own takes a third of six minutes
+    shipped         cohdc fit SET --minutes M                       (README's command: starts from
+    the shipped weights) imagenet        the same with --pretrained mobilenet_v2.pth
+    torchvision-LR  torchvision's references/detection recipe, written in reference_loops.py: SGD
+    .9, weight decay
+                    1e-4, frozen norms and first two parts, horizontal flip, warm-up of its first
+                    epoch (at most 1000 steps), rate divided by ten at 16/26 and 22/26 of the
+                    budget; the same ImageNet weights and canvas
+    torchvision-LR-short   the same with a warm-up of 5 % of the budget: its own takes a third of
+    six minutes
 
-All have the same network (networks/hdc_net_n.yaml), canvas and batch size. The clock of `cohdc fit` includes its
-validations; torchvision's clock stops while it is scored. The last weights of each are scored by pycocotools on the
-validation split. A cell that is finished lies in DIR and is not trained again. Writes DIR/results.json, table.md and
-curves.png.
+All have the same network (networks/hdc_net_n.yaml), canvas and batch size. The clock of `cohdc fit`
+includes its validations; torchvision's clock stops while it is scored. The last weights of each are
+scored by pycocotools on the validation split. A cell that is finished lies in DIR and is not
+trained again. Writes DIR/results.json, table.md and curves.png.
 """
 
 import argparse
@@ -38,16 +43,25 @@ POINTS = 4  # of torchvision's curve
 
 def parse_arguments() -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="COCO-format folders")
-    parser.add_argument("--imagenet", type=Path, required=True, help="state dict of torchvision's mobilenet_v2")
+    parser.add_argument(
+        "--imagenet", type=Path, required=True, help="state dict of torchvision's mobilenet_v2"
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, nargs="+", default=[6.0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--precision", default="32-true", help="of cohdc fit; torchvision's recipe is float32")
+    parser.add_argument(
+        "--precision", default="32-true", help="of cohdc fit; torchvision's recipe is float32"
+    )
     parser.add_argument("--contenders", nargs="*", help="these only")
     parser.add_argument(
-        "--cell", nargs=5, metavar=("NAME", "DATA", "MINUTES", "SEED", "FOLDER"), help=argparse.SUPPRESS
+        "--cell",
+        nargs=5,
+        metavar=("NAME", "DATA", "MINUTES", "SEED", "FOLDER"),
+        help=argparse.SUPPRESS,
     )
     return parser.parse_args()
 
@@ -73,8 +87,14 @@ def main() -> int:
         for data in arguments.data
         for name in names
     ]
-    run_pairs([cell for cell in waiting if not (folder_of(arguments.out, *cell) / "cell.json").is_file()], arguments)
-    cells = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(arguments.out.glob("*/cell.json"))]
+    run_pairs(
+        [cell for cell in waiting if not (folder_of(arguments.out, *cell) / "cell.json").is_file()],
+        arguments,
+    )
+    cells = [
+        json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(arguments.out.glob("*/cell.json"))
+    ]
     (arguments.out / "results.json").write_text(json.dumps(cells, indent=1), encoding="utf-8")
     table = as_table(cells)
     (arguments.out / "table.md").write_text(table, encoding="utf-8")
@@ -98,41 +118,81 @@ def run_pairs(cells: list[tuple[str, Path, float, int]], arguments: argparse.Nam
             folder = folder_of(arguments.out, *cell)
             folder.mkdir(parents=True, exist_ok=True)
             own = [name, str(data), str(minutes), str(seed), str(folder)]
-            fixed = ["--data", str(data), "--imagenet", str(arguments.imagenet.resolve()), "--out", str(arguments.out)]
-            command = [sys.executable, __file__, *fixed, f"--precision={arguments.precision}", "--cell", *own]
+            fixed = [
+                "--data",
+                str(data),
+                "--imagenet",
+                str(arguments.imagenet.resolve()),
+                "--out",
+                str(arguments.out),
+            ]
+            command = [
+                sys.executable,
+                __file__,
+                *fixed,
+                f"--precision={arguments.precision}",
+                "--cell",
+                *own,
+            ]
             environment = os.environ | {"OMP_NUM_THREADS": "1"}
             log = (folder / "log.txt").open("w", encoding="utf-8")
             pin = ["taskset", "-c", str(core)]
-            running.append((cell, subprocess.Popen([*pin, *command], env=environment, stdout=log, stderr=log)))
+            running.append(
+                (cell, subprocess.Popen([*pin, *command], env=environment, stdout=log, stderr=log))
+            )
         for cell, process in running:
             if process.wait():
                 raise SystemExit(f"{folder_of(arguments.out, *cell)}/log.txt: the cell failed")
 
 
-def train_cell(name: str, data: Path, minutes: float, seed: int, folder: Path, arguments: argparse.Namespace) -> None:
+def train_cell(
+    name: str, data: Path, minutes: float, seed: int, folder: Path, arguments: argparse.Namespace
+) -> None:
     """Train and score one contender; write folder/cell.json."""
     if name.startswith("torchvision"):
         _, rate, *short = name.split("-")
-        curve, images, segm = train_torchvision(data, arguments.imagenet, minutes, seed, float(rate), bool(short))
+        curve, images, segm = train_torchvision(
+            data, arguments.imagenet, minutes, seed, float(rate), bool(short)
+        )
     else:
         pretrained = str(arguments.imagenet) if name == "imagenet" else "auto"
-        curve, images, segm = train_ours(data, pretrained, minutes, seed, folder, arguments.precision)
-    row = {"contender": name, "data": data.name, "minutes": minutes, "seed": seed, "images_seen": images, **segm}
-    row |= {"precision": "32-true" if name.startswith("torchvision") else arguments.precision, "curve": curve}
+        curve, images, segm = train_ours(
+            data, pretrained, minutes, seed, folder, arguments.precision
+        )
+    row = {
+        "contender": name,
+        "data": data.name,
+        "minutes": minutes,
+        "seed": seed,
+        "images_seen": images,
+        **segm,
+    }
+    row |= {
+        "precision": "32-true" if name.startswith("torchvision") else arguments.precision,
+        "curve": curve,
+    }
     (folder / "cell.json").write_text(json.dumps(row, indent=1), encoding="utf-8")
 
 
-def fit_command(data: Path, pretrained: str, minutes: float, seed: int, folder: Path, precision: str) -> list[str]:
+def fit_command(
+    data: Path, pretrained: str, minutes: float, seed: int, folder: Path, precision: str
+) -> list[str]:
     """Return the arguments of `cohdc fit`: README's command, and what an experiment fixes."""
     readme = [str(data), f"--minutes={minutes:g}", f"--out={folder / 'fit'}"]
-    fixed = [f"--seed_everything={seed}", f"--trainer.precision={precision}", f"--pretrained={pretrained}"]
+    fixed = [
+        f"--seed_everything={seed}",
+        f"--trainer.precision={precision}",
+        f"--pretrained={pretrained}",
+    ]
     return [*readme, *fixed, "--data.workers=0", "--trainer.enable_progress_bar=false"]
 
 
 def train_ours(
     data: Path, pretrained: str, minutes: float, seed: int, folder: Path, precision: str
 ) -> tuple[list[tuple[float, float]], int, dict[str, float]]:
-    """Run `cohdc fit` and score its last.ckpt. Returns the curve (minutes, AP), images seen, and scores."""
+    """Run `cohdc fit` and score its last.ckpt. Returns the curve (minutes, AP), images seen, and
+    scores.
+    """
     from cohdc_train.train.cli import fit
     from cohdc_train.train.module import MaskRCNNModule
 
@@ -142,7 +202,9 @@ def train_ours(
     with log.open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     curve = [
-        (minutes * (int(row["step"]) + 1) / steps, float(row["val/segm_AP"])) for row in rows if row.get("val/segm_AP")
+        (minutes * (int(row["step"]) + 1) / steps, float(row["val/segm_AP"]))
+        for row in rows
+        if row.get("val/segm_AP")
     ]
     module = MaskRCNNModule.load(folder / "fit" / "last.ckpt")
     return curve, steps * BATCH_SIZE, score_ours(module, data)
@@ -168,14 +230,22 @@ def score_ours(module: Any, data: Path) -> dict[str, float]:
         for row in encode(image.id, (image.height, image.width), detections):
             label = row["category_id"]
             wanted = {key: row[key] for key in ("image_id", "bbox", "segmentation")}
-            rows.append({**wanted, "category_id": images.category[label], "score": row["score"] * row["quality"]})
+            rows.append(
+                {
+                    **wanted,
+                    "category_id": images.category[label],
+                    "score": row["score"] * row["quality"],
+                }
+            )
     return coco_scores(images, [image.id for image in split.images], rows)
 
 
 def train_torchvision(
     data: Path, imagenet: Path, minutes: float, seed: int, rate: float, has_short_warmup: bool
 ) -> tuple[list[tuple[float, float]], int, dict[str, float]]:
-    """Train torchvision's Mask R-CNN of the same parts by its recipe, for so many minutes. Returns as train_ours."""
+    """Train torchvision's Mask R-CNN of the same parts by its recipe, for so many minutes. Returns
+    as train_ours.
+    """
     import reference_loops
     import torch
     import yaml
@@ -189,15 +259,21 @@ def train_torchvision(
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     folder = CocoDataModule(data)
-    shape = yaml.safe_load(config_path("networks/hdc_net_n.yaml").read_text(encoding="utf-8"))["model"]["network"]
+    shape = yaml.safe_load(config_path("networks/hdc_net_n.yaml").read_text(encoding="utf-8"))[
+        "model"
+    ]["network"]
     config = NetworkConfig(**{**shape, "weights": str(imagenet), "canvas": folder.canvas})
     network = reference_loops.same_network(MaskRCNNModule(folder.class_names, config)).train()
 
     images = reference_loops.Images(folder.folder.train[0], flip=0.5)
     validation = folder.folder.val
     val_images = reference_loops.Images(validation, flip=0.0)
-    loader = DataLoader(images, BATCH_SIZE, shuffle=True, collate_fn=lambda batch: tuple(zip(*batch, strict=True)))
-    optimizer = torch.optim.SGD([p for p in network.parameters() if p.requires_grad], rate, 0.9, weight_decay=1e-4)
+    loader = DataLoader(
+        images, BATCH_SIZE, shuffle=True, collate_fn=lambda batch: tuple(zip(*batch, strict=True))
+    )
+    optimizer = torch.optim.SGD(
+        [p for p in network.parameters() if p.requires_grad], rate, 0.9, weight_decay=1e-4
+    )
     warmup_steps = min(1000, len(loader) - 1)
 
     budget, spent, step, curve = 60 * minutes, 0.0, 0, []
@@ -206,18 +282,28 @@ def train_torchvision(
         for pictures, targets in loader:
             started = time.monotonic()
             for group in optimizer.param_groups:
-                warmup = spent / budget / SHORT_WARMUP if has_short_warmup else step / max(1, warmup_steps)
+                warmup = (
+                    spent / budget / SHORT_WARMUP
+                    if has_short_warmup
+                    else step / max(1, warmup_steps)
+                )
                 group["lr"] = rate * recipe_factor(warmup, spent / budget)
             losses = sum(network(list(pictures), [dict(target) for target in targets]).values())
             if not torch.isfinite(losses):
-                return [*curve, (spent / 60, 0.0)], step * BATCH_SIZE, {"AP": 0.0, "AP50": 0.0, "box_AP": 0.0}
+                return (
+                    [*curve, (spent / 60, 0.0)],
+                    step * BATCH_SIZE,
+                    {"AP": 0.0, "AP50": 0.0, "box_AP": 0.0},
+                )
             optimizer.zero_grad()
             losses.backward()
             optimizer.step()
             step += 1
             spent += time.monotonic() - started
             if spent >= budget * (len(curve) + 1) / POINTS or spent >= budget:
-                scores = score_torchvision(network, val_images, [image.id for image in validation.images])
+                scores = score_torchvision(
+                    network, val_images, [image.id for image in validation.images]
+                )
                 curve.append((spent / 60, scores["AP"]))
                 network.train()
             if spent >= budget:
@@ -225,7 +311,8 @@ def train_torchvision(
 
 
 def recipe_factor(warmup: float, progress: float) -> float:
-    """Return the share of the rate: torchvision's linear warm-up, and its drops at epochs 16 and 22 of 26.
+    """Return the share of the rate: torchvision's linear warm-up, and its drops at epochs 16 and 22
+    of 26.
 
     warmup: share of the warm-up that is over; progress: share of the budget that is used.
     """
@@ -249,7 +336,9 @@ def score_torchvision(network: Any, images: Any, image_ids: list[int]) -> dict[s
 
 
 def as_table(cells: list[dict[str, Any]]) -> str:
-    """Return a Markdown table: one row per set and budget, mask AP / AP50 of every contender, mean over seeds."""
+    """Return a Markdown table: one row per set and budget, mask AP / AP50 of every contender, mean
+    over seeds.
+    """
     import numpy as np
 
     names = [name for name in contenders() if any(cell["contender"] == name for cell in cells)]
@@ -259,7 +348,11 @@ def as_table(cells: list[dict[str, Any]]) -> str:
         columns = []
         for name in names:
             own = [cell for cell in here if cell["contender"] == name]
-            mean = [float(np.mean([cell[key] for cell in own])) for key in ("AP", "AP50")] if own else []
+            mean = (
+                [float(np.mean([cell[key] for cell in own])) for key in ("AP", "AP50")]
+                if own
+                else []
+            )
             columns.append(f"{mean[0]:.3f} / {mean[1]:.3f} ({len(own)})" if mean else "")
         seeds = sorted({cell["seed"] for cell in here})
         lines.append(f"| {data}, {minutes:g}, {seeds} | {' | '.join(columns)} |")
@@ -273,15 +366,21 @@ def plot_curves(cells: list[dict[str, Any]], path: Path) -> None:
     panels = sorted({(cell["data"], cell["minutes"]) for cell in cells})
     figure = Figure(figsize=(5 * max(1, len(panels)), 4), layout="constrained")
     colors = {name: f"C{i}" for i, name in enumerate(contenders())}
-    for axes, panel in zip(figure.subplots(1, max(1, len(panels)), squeeze=False)[0], panels, strict=True):
+    for axes, panel in zip(
+        figure.subplots(1, max(1, len(panels)), squeeze=False)[0], panels, strict=True
+    ):
         labeled: set[str] = set()
         for cell in cells:
             name = cell["contender"]
             if (cell["data"], cell["minutes"]) == panel and cell["curve"]:
                 times, scores = zip(*[(0.0, 0.0), *cell["curve"]], strict=True)
-                axes.plot(times, scores, "o-", color=colors[name], label=None if name in labeled else name)
+                axes.plot(
+                    times, scores, "o-", color=colors[name], label=None if name in labeled else name
+                )
                 labeled.add(name)
-        axes.set(title=f"{panel[0]}, {panel[1]:g} min", xlabel="minutes, one core", ylabel="mask AP")
+        axes.set(
+            title=f"{panel[0]}, {panel[1]:g} min", xlabel="minutes, one core", ylabel="mask AP"
+        )
         axes.grid(alpha=0.3)
         axes.legend()
     figure.savefig(path, dpi=110)

@@ -4,8 +4,8 @@
     tools/experiments/person_data.py --data COCO_SMALL COCO_PEOPLE --out DIR [--held 150] [--seed 0]
 
 Merges the training splits of the folders, person annotations only, into DIR/images (links) and
-DIR/instances_train.json. --held images of the last folder become DIR/instances_val.json instead: choices are made on
-them, because the validation split of the first folder is what the cards report.
+DIR/instances_train.json. --held images of the last folder become DIR/instances_val.json instead:
+choices are made on them, because the validation split of the first folder is what the cards report.
 """
 
 import argparse
@@ -19,10 +19,14 @@ CLASS = "person"
 
 def main() -> int:
     """Merge, hold out, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="COCO-format folders")
     parser.add_argument("--out", type=Path, required=True, help="new folder")
-    parser.add_argument("--held", type=int, default=150, help="images of the last folder to choose by")
+    parser.add_argument(
+        "--held", type=int, default=150, help="images of the last folder to choose by"
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 
@@ -41,12 +45,18 @@ def main() -> int:
             "annotations": [row for row in annotations if (row["image_id"] in held) == wanted],
             "categories": [{"id": 1, "name": CLASS}],
         }
-        (arguments.out / f"instances_{split}.json").write_text(json.dumps(content), encoding="utf-8")
-        print(f"{split}: {len(content['images'])} images, {len(content['annotations'])} annotations")
+        (arguments.out / f"instances_{split}.json").write_text(
+            json.dumps(content), encoding="utf-8"
+        )
+        print(
+            f"{split}: {len(content['images'])} images, {len(content['annotations'])} annotations"
+        )
     return 0
 
 
-def add_folder(folder: Path, target: Path, images: list[dict[str, Any]], annotations: list[dict[str, Any]]) -> None:
+def add_folder(
+    folder: Path, target: Path, images: list[dict[str, Any]], annotations: list[dict[str, Any]]
+) -> None:
     """Append a folder's training images and person annotations under new ids, and link its images."""
     coco = json.loads((folder / "instances_train.json").read_text(encoding="utf-8"))
     person = next(row["id"] for row in coco["categories"] if row["name"] == CLASS)
@@ -59,7 +69,11 @@ def add_folder(folder: Path, target: Path, images: list[dict[str, Any]], annotat
         images.append({"id": len(images) + 1, "file_name": name, **size})
     for row in coco["annotations"]:
         if row["category_id"] == person:
-            owner = {"id": len(annotations) + 1, "image_id": new_ids[row["image_id"]], "category_id": 1}
+            owner = {
+                "id": len(annotations) + 1,
+                "image_id": new_ids[row["image_id"]],
+                "category_id": 1,
+            }
             annotations.append(row | owner)
 
 

@@ -1,13 +1,15 @@
 #!/usr/bin/env python3
-"""The person networks of the HDC-Net family, from photographs and rendered people to a scored int8 file.
+"""The person networks of the HDC-Net family, from photographs and rendered people to a scored int8
+file.
 
     tools/experiments/person_model.py n --data COCO_SMALL --out DIR
         [--weights BACKBONE.pth | --pretrained person [--mean]]
 
-Renders DIR/synth and, with people close to the camera, DIR/near, trains DIR/fit, exports DIR/person.onnx and
-person.int8.onnx, calibrated on training photographs, and writes the scores of both on the validation
-photographs to DIR/scores.json. What is trained already is not trained again. With --minutes 0 nothing is trained:
---pretrained is written anew, as the package exports and quantises now.
+Renders DIR/synth and, with people close to the camera, DIR/near, trains DIR/fit, exports
+DIR/person.onnx and person.int8.onnx, calibrated on training photographs, and writes the scores of
+both on the validation photographs to DIR/scores.json. What is trained already is not trained again.
+With --minutes 0 nothing is trained: --pretrained is written anew, as the package exports and
+quantises now.
 """
 
 import argparse
@@ -35,13 +37,23 @@ NEAR = (0.45, 1.3)  # m from the camera
 
 def main() -> None:
     """Render, train, export, score."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("size", choices=CANVAS)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--weights", default="imagenet", help="of the backbone, to begin with: imagenet or a file")
-    parser.add_argument("--pretrained", help="checkpoint, exported file or shipped network to begin with instead")
-    parser.add_argument("--mean", action="store_true", help="export the mean of --pretrained's weights and the trained")
+    parser.add_argument(
+        "--weights", default="imagenet", help="of the backbone, to begin with: imagenet or a file"
+    )
+    parser.add_argument(
+        "--pretrained", help="checkpoint, exported file or shipped network to begin with instead"
+    )
+    parser.add_argument(
+        "--mean",
+        action="store_true",
+        help="export the mean of --pretrained's weights and the trained",
+    )
     budgets = parser.add_mutually_exclusive_group()
     budgets.add_argument("--epochs", type=int, help="person.yaml's, 28")
     budgets.add_argument("--minutes", type=int, help="budget of training instead of epochs")
@@ -56,7 +68,9 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     canvas = CANVAS[arguments.size]
     if arguments.minutes == 0:
-        checkpoint = untrained(arguments.size, canvas, model_path(arguments.pretrained), out / "untrained.ckpt")
+        checkpoint = untrained(
+            arguments.size, canvas, model_path(arguments.pretrained), out / "untrained.ckpt"
+        )
     else:
         checkpoint = trained(arguments, data, out, canvas)
     photographs = out / "calibration"
@@ -65,7 +79,15 @@ def main() -> None:
         if not (link := photographs / image.path.name).exists():
             link.symlink_to(image.path)
     file = out / "person.onnx"
-    export(checkpoint, file, canvas=canvas, images=photographs, int8=photographs, data=data, allow_drop=True)
+    export(
+        checkpoint,
+        file,
+        canvas=canvas,
+        images=photographs,
+        int8=photographs,
+        data=data,
+        allow_drop=True,
+    )
     scores = {
         kind: score_file(path, data, threads=arguments.threads).scores
         for kind, path in (("float32", file), ("int8", out / "person.int8.onnx"))
@@ -75,7 +97,9 @@ def main() -> None:
 
 
 def trained(arguments: argparse.Namespace, data: Path, out: Path, canvas: tuple[int, int]) -> Path:
-    """The checkpoint of a training on photographs and rendered people, or, with --mean, of the weights halfway."""
+    """The checkpoint of a training on photographs and rendered people, or, with --mean, of the
+    weights halfway.
+    """
     if not (out / "synth").is_dir():
         coco(out / "synth", train=64, val=8, size=(384, 512), seed=7)
     if not (out / "near").is_dir():
@@ -87,7 +111,9 @@ def trained(arguments: argparse.Namespace, data: Path, out: Path, canvas: tuple[
         *budget(arguments.epochs or 28, arguments.minutes),
         *([f"--model.optimizer.lr={arguments.lr}"] if arguments.lr else []),
     )
-    checkpoint = train(out / "fit", [data, out / "synth", out / "near"], options, arguments.threads).checkpoint
+    checkpoint = train(
+        out / "fit", [data, out / "synth", out / "near"], options, arguments.threads
+    ).checkpoint
     if not arguments.mean:
         return checkpoint
     return mean_with_start(checkpoint, model_path(arguments.pretrained), out / "mean.ckpt")
@@ -107,7 +133,10 @@ def untrained(size: str, canvas: tuple[int, int], began: Path, out: Path) -> Pat
 
 def mean_with_start(ended: Path, began: Path, out: Path) -> Path:
     """A checkpoint of the weights halfway from those a training began with to those it ended with."""
-    module, stored = MaskRCNNModule.load(ended), torch.load(ended, map_location="cpu", weights_only=True)
+    module, stored = (
+        MaskRCNNModule.load(ended),
+        torch.load(ended, map_location="cpu", weights_only=True),
+    )
     last = {name: weights.clone() for name, weights in module.network.state_dict().items()}
     module.take_over(began)
     for name, weights in module.network.state_dict().items():

@@ -1,4 +1,6 @@
-"""Torchvision's detection training and evaluation, in our own words: what the experiments compare with."""
+"""Torchvision's detection training and evaluation, in our own words: what the experiments compare
+with.
+"""
 
 import argparse
 import contextlib
@@ -20,16 +22,26 @@ from torchvision.transforms.v2.functional import horizontal_flip, pil_to_tensor,
 from cohdc_train.models.frozen_norm import FrozenNorm, plain_convolution
 
 
-def train(module: Any, data: Any, positions: list[int], args: argparse.Namespace, gate: Any) -> None:
+def train(
+    module: Any, data: Any, positions: list[int], args: argparse.Namespace, gate: Any
+) -> None:
     """What torchvision's references/detection does for one epoch, in our own words."""
     network = same_network(module).train()
     split = data.folder.train[0]
     images = Images(split, flip=0.5)
     place = {image_id: i for i, image_id in enumerate(images.coco.ids)}
     positions = [place[split.images[i].id] for i in positions]
-    loader = DataLoader(Subset(images, positions), args.batch, collate_fn=lambda batch: tuple(zip(*batch)))  # noqa: B905
-    optimizer = torch.optim.SGD([p for p in network.parameters() if p.requires_grad], 1e-3, 0.9, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1e-3, total_iters=min(1000, len(loader) - 1))
+    loader = DataLoader(
+        Subset(images, positions),
+        args.batch,
+        collate_fn=lambda batch: tuple(zip(*batch, strict=True)),
+    )
+    optimizer = torch.optim.SGD(
+        [p for p in network.parameters() if p.requires_grad], 1e-3, 0.9, weight_decay=1e-4
+    )
+    schedule = torch.optim.lr_scheduler.LinearLR(
+        optimizer, 1e-3, total_iters=min(1000, len(loader) - 1)
+    )
     gate.next()
     for step, (pictures, targets) in enumerate(loader, 1):
         losses = network(list(pictures), [dict(target) for target in targets])
@@ -61,16 +73,24 @@ def validate(module: Any, data: Any, args: argparse.Namespace, gate: Any) -> Non
     print(f"reference: segm AP {stats['segm']:.3f}, box AP {stats['bbox']:.3f}", flush=True)
 
 
-def coco_scores(images: "Images", chosen: list[int], rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return mask AP, mask AP50 and box AP by pycocotools over the chosen image ids; 0 without a detection."""
+def coco_scores(
+    images: "Images", chosen: list[int], rows: list[dict[str, Any]]
+) -> dict[str, float]:
+    """Return mask AP, mask AP50 and box AP by pycocotools over the chosen image ids; 0 without a
+    detection.
+    """
     if not rows:
         return {"AP": 0.0, "AP50": 0.0, "box_AP": 0.0}
     masks, boxes = (coco_stats(images, chosen, rows, kind) for kind in ("segm", "bbox"))
     return {"AP": masks[0], "AP50": masks[1], "box_AP": boxes[0]}
 
 
-def coco_stats(images: "Images", chosen: list[int], rows: list[dict[str, Any]], kind: str) -> list[float]:
-    """Return pycocotools' twelve figures of boxes ("bbox") or masks ("segm") over the chosen image ids."""
+def coco_stats(
+    images: "Images", chosen: list[int], rows: list[dict[str, Any]], kind: str
+) -> list[float]:
+    """Return pycocotools' twelve figures of boxes ("bbox") or masks ("segm") over the chosen image
+    ids.
+    """
     other = "bbox" if kind == "segm" else "segmentation"
     truth = images.coco.coco
     with contextlib.redirect_stdout(io.StringIO()):
@@ -83,9 +103,13 @@ def coco_stats(images: "Images", chosen: list[int], rows: list[dict[str, Any]], 
     return [float(value) for value in scored.stats]
 
 
-def result_rows(image_id: int, found: dict[str, Any], category: dict[int, int]) -> Iterator[dict[str, Any]]:
+def result_rows(
+    image_id: int, found: dict[str, Any], category: dict[int, int]
+) -> Iterator[dict[str, Any]]:
     """COCO result rows of torchvision's detections of one image, masks pasted by it."""
-    for box, label, score, mask in zip(*(found[key] for key in ("boxes", "labels", "scores", "masks")), strict=True):
+    for box, label, score, mask in zip(
+        *(found[key] for key in ("boxes", "labels", "scores", "masks")), strict=True
+    ):
         x0, y0, x1, y1 = box.tolist()
         encoded = rle.encode(np.array(mask[0, :, :, None] > 0.5, dtype=np.uint8, order="F"))[0]
         encoded["counts"] = encoded["counts"].decode()
@@ -116,15 +140,23 @@ class Images:
         boxes[:, 1::2].clamp_(0, height)
         shapes = [row["segmentation"] for row in rows]
         shapes = [[s] if isinstance(s, dict) else rle.frPyObjects(s, height, width) for s in shapes]
-        drawn = [torch.as_tensor(rle.decode(shape), dtype=torch.uint8).any(dim=2) for shape in shapes]
-        stacked = torch.stack(drawn) if drawn else torch.zeros((0, height, width), dtype=torch.uint8)
+        drawn = [
+            torch.as_tensor(rle.decode(shape), dtype=torch.uint8).any(dim=2) for shape in shapes
+        ]
+        stacked = (
+            torch.stack(drawn) if drawn else torch.zeros((0, height, width), dtype=torch.uint8)
+        )
         labels = torch.tensor([label[row["category_id"]] for row in rows], dtype=torch.int64)
         keep = (boxes[:, 2:] > boxes[:, :2]).all(dim=1)
         image, boxes, stacked = pil_to_tensor(picture), boxes[keep], stacked[keep]
         if self.flip and torch.rand(1) < self.flip:
             image, stacked = horizontal_flip(image), stacked.flip(-1)
             boxes[:, [0, 2]] = width - boxes[:, [2, 0]]
-        return to_dtype(image, torch.float32, scale=True), {"boxes": boxes, "labels": labels[keep], "masks": stacked}
+        return to_dtype(image, torch.float32, scale=True), {
+            "boxes": boxes,
+            "labels": labels[keep],
+            "masks": stacked,
+        }
 
 
 def with_torchvision_norms(network: torch.nn.Module) -> torch.nn.Module:
@@ -141,7 +173,9 @@ def with_torchvision_norms(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def same_network(module: Any) -> Any:
-    """Build torchvision's Mask R-CNN of the same parts and weights; every image is resized to the canvas."""
+    """Build torchvision's Mask R-CNN of the same parts and weights; every image is resized to the
+    canvas.
+    """
     ours, config = module.network, module.network_config
     with_torchvision_norms(ours)
     heads = ours.roi_heads
@@ -149,10 +183,24 @@ def same_network(module: Any) -> Any:
     return MaskRCNN(
         ours.backbone,
         **{"rpn_anchor_generator": ours.rpn.anchor_generator, "rpn_head": ours.rpn.head},
-        **{"box_roi_pool": heads.box_roi_pool, "box_head": heads.box_head, "box_predictor": heads.box_predictor},
-        **{"mask_roi_pool": heads.mask_roi_pool, "mask_head": heads.mask_head, "mask_predictor": heads.mask_predictor},
-        **{"rpn_pre_nms_top_n_train": 2 * config.proposals[0], "rpn_post_nms_top_n_train": config.proposals[0]},
-        **{"rpn_pre_nms_top_n_test": 2 * config.proposals[1], "rpn_post_nms_top_n_test": config.proposals[1]},
+        **{
+            "box_roi_pool": heads.box_roi_pool,
+            "box_head": heads.box_head,
+            "box_predictor": heads.box_predictor,
+        },
+        **{
+            "mask_roi_pool": heads.mask_roi_pool,
+            "mask_head": heads.mask_head,
+            "mask_predictor": heads.mask_predictor,
+        },
+        **{
+            "rpn_pre_nms_top_n_train": 2 * config.proposals[0],
+            "rpn_post_nms_top_n_train": config.proposals[0],
+        },
+        **{
+            "rpn_pre_nms_top_n_test": 2 * config.proposals[1],
+            "rpn_post_nms_top_n_test": config.proposals[1],
+        },
         **{"box_score_thresh": config.score_threshold, "box_nms_thresh": config.nms_iou},
         **{"box_detections_per_img": config.detections, "box_batch_size_per_image": config.rois},
         fixed_size=(config.canvas[1], config.canvas[0]),

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""A start for ResNet-101 where only ResNet-50's ImageNet weights can be had: the blocks that both have, and copies.
+"""A start for ResNet-101 where only ResNet-50's ImageNet weights can be had: the blocks that both
+have, and copies.
 
     tools/experiments/resnet101_start.py RESNET50.pth OUT.pth
 
-ResNet-101 has 17 blocks more in layer3. Each starts as ResNet-50's last block there, its residual scaled to a tenth, so
-that the network begins near ResNet-50. These are not ImageNet weights of ResNet-101, and a table says so.
+ResNet-101 has 17 blocks more in layer3. Each starts as ResNet-50's last block there, its residual
+scaled to a tenth, so that the network begins near ResNet-50. These are not ImageNet weights of
+ResNet-101, and a table says so.
 """
 
 import sys
@@ -24,7 +26,11 @@ def main() -> None:
     for index in range(LAST + 1, BLOCKS):
         for key, value in block.items():
             name = key.replace(f"layer3.{LAST}.", f"layer3.{index}.")
-            state[name] = value * SHARE if ".bn3." in name and name.endswith((".weight", ".bias")) else value.clone()
+            state[name] = (
+                value * SHARE
+                if ".bn3." in name and name.endswith((".weight", ".bias"))
+                else value.clone()
+            )
     torch.save(state, sys.argv[2])
 
 

@@ -1,14 +1,16 @@
 #!/usr/bin/env python3
-"""Dynamic SLAM scored on rendered sequences whose truth is exact: walks, carts, crowds, a loop, plain walls and more.
+"""Dynamic SLAM scored on rendered sequences whose truth is exact: walks, carts, crowds, a loop,
+plain walls and more.
 
     tools/experiments/slam_evaluation.py --root DIR --out OUT [--model person] [--seeds 0 1 2]
         [--method loops=false ...]
 
-Renders what is missing of the sequences below DIR (12 of --frames frames, the loop twice as long), then runs
-`cohdc slam` in process on each: without masks ("none"), with the true people ("masks"), with whatever truly moves
-("movers"), and with --model ("model"). Every run's row goes into OUT/evaluation.json as soon as it is there; a row that
-is there is not made again, but rows of other code under cohdc_train/slam are dropped. OUT/evaluation.md has the medians
-and the worst over the seeds; the latest run's files lie in OUT/SEQUENCE.
+Renders what is missing of the sequences below DIR (12 of --frames frames, the loop twice as long),
+then runs `cohdc slam` in process on each: without masks ("none"), with the true people ("masks"),
+with whatever truly moves ("movers"), and with --model ("model"). Every run's row goes into
+OUT/evaluation.json as soon as it is there; a row that is there is not made again, but rows of other
+code under cohdc_train/slam are dropped. OUT/evaluation.md has the medians and the worst over the
+seeds; the latest run's files lie in OUT/SEQUENCE.
 """
 
 import argparse
@@ -73,7 +75,12 @@ def main() -> None:
         frames = KINDS[name].length * arguments.frames
         render(arguments.root / name, KINDS[name], frames, arguments.size)
         for mode, seed in ((mode, seed) for mode in arguments.modes for seed in arguments.seeds):
-            asked: Row = {"sequence": name, "mode": mode, "seed": seed, "method": asdict(arguments.method)}
+            asked: Row = {
+                "sequence": name,
+                "mode": mode,
+                "seed": seed,
+                "method": asdict(arguments.method),
+            }
             asked |= {"frames": frames, "size": list(arguments.size), "code": code}
             asked |= {"model": sha256(model_path(arguments.model))} if mode == "model" else {}
             if any(all(row.get(key) == value for key, value in asked.items()) for row in rows):
@@ -92,19 +99,33 @@ def main() -> None:
 
 def parse() -> argparse.Namespace:
     """The arguments; `method` is a Method, `modes` those that can run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", type=Path, required=True, help="where the rendered sequences are or go")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--root", type=Path, required=True, help="where the rendered sequences are or go"
+    )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--sequences", nargs="+", choices=KINDS, default=list(KINDS), metavar="NAME")
+    parser.add_argument(
+        "--sequences", nargs="+", choices=KINDS, default=list(KINDS), metavar="NAME"
+    )
     parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
-    parser.add_argument("--model", type=Path, help="ONNX or a shipped network's name; without it, no mode `model`")
+    parser.add_argument(
+        "--model", type=Path, help="ONNX or a shipped network's name; without it, no mode `model`"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     add_method_option(parser)
     parser.add_argument("--frames", type=int, default=200, help="of a sequence of length 1")
-    parser.add_argument("--size", type=int, nargs=2, default=(480, 640), metavar=("HEIGHT", "WIDTH"))
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_FRAMES} frames of {QUICK_SIZE} px")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(480, 640), metavar=("HEIGHT", "WIDTH")
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help=f"{QUICK_FRAMES} frames of {QUICK_SIZE} px"
+    )
     arguments = parser.parse_args()
-    arguments.modes = [mode for mode in arguments.modes if mode != "model" or arguments.model is not None]
+    arguments.modes = [
+        mode for mode in arguments.modes if mode != "model" or arguments.model is not None
+    ]
     if arguments.quick:
         arguments.frames, arguments.size = QUICK_FRAMES, QUICK_SIZE
     return arguments
@@ -123,12 +144,19 @@ def kept(path: Path, code: str) -> list[Row]:
 
 def render(folder: Path, kind: Kind, frames: int, size: tuple[int, int]) -> None:
     """Render a sequence unless it lies there. Raises SystemExit when another one does."""
-    wanted = {"seed": kind.seed, "motion": kind.motion, "people": kind.people, "scene": asdict(kind.scene)}
+    wanted = {
+        "seed": kind.seed,
+        "motion": kind.motion,
+        "people": kind.people,
+        "scene": asdict(kind.scene),
+    }
     wanted |= {"frames": frames, "size": list(size)}
     if (folder / "info.json").is_file():
         there = json.loads((folder / "info.json").read_text())
         if any(there.get(key) != value for key, value in wanted.items()):
-            raise SystemExit(f"{folder}: rendered with other options; remove it or give another --root")
+            raise SystemExit(
+                f"{folder}: rendered with other options; remove it or give another --root"
+            )
         return
     sequence(folder, frames, (size[0], size[1]), kind.seed, kind.motion, kind.people, kind.scene)
 
@@ -140,12 +168,16 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
     given |= {"masks": folder / mode} if mode in ("masks", "movers") else {}
     out = arguments.out / name / f"{mode}_seed{seed}"
     metrics = slam(sequence=folder, out=out, seed=seed, method=arguments.method, **given)
-    row = {error: metrics.get(error, {}).get("rmse") for error in ("ate_m", "rpe_1s_m", "rpe_1s_deg")}
+    row = {
+        error: metrics.get(error, {}).get("rmse") for error in ("ate_m", "rpe_1s_m", "rpe_1s_deg")
+    }
     return row | {"coverage": metrics["coverage"], "track_ms": metrics["ms"]["track"]["p50"]}
 
 
 def tables(rows: list[Row]) -> str:
-    """A table per method: ATE RMSE of every sequence and mode, median and worst over the seeds, and coverage."""
+    """A table per method: ATE RMSE of every sequence and mode, median and worst over the seeds, and
+    coverage.
+    """
     parts = []
     for method in unique(json.dumps(row["method"]) for row in rows):
         ours = [row for row in rows if json.dumps(row["method"]) == method]
@@ -155,7 +187,10 @@ def tables(rows: list[Row]) -> str:
             "|---" * (len(modes) + 1) + "|",
         ]
         for name in unique(row["sequence"] for row in ours):
-            cells = [cell([r for r in ours if r["sequence"] == name and r["mode"] == mode]) for mode in modes]
+            cells = [
+                cell([r for r in ours if r["sequence"] == name and r["mode"] == mode])
+                for mode in modes
+            ]
             lines.append(f"| {name} | {' | '.join(cells)} |")
         switches = ", ".join(f"{key} {value}" for key, value in json.loads(method).items())
         parts.append(f"### {switches}\n\n" + "\n".join(lines) + "\n")

@@ -1,13 +1,15 @@
 #!/usr/bin/env python3
-"""How `cohdc slam`'s memory and time grow over minutes: a recorded sequence, played forth and back, synchronously.
+"""How `cohdc slam`'s memory and time grow over minutes: a recorded sequence, played forth and back,
+synchronously.
 
     tools/experiments/slam_memory.py --sequence DIR --out OUT [--frames 18000] [--features 500]
         [--shrink 2] [--method KEY=VALUE ...]
 
-Frames come at 30 a second, images a --shrink-th as wide and high; they are read into memory first. A line every
---every frames: resident memory beyond that before the first frame, keyframes and points the map holds, keyframes made
-since the line before, and CPU time per frame. Results go to OUT as `cohdc slam` writes them; the truth goes forth and
-back, too. Rolling shutter and the time between colour and depth are left out, for they would be wrong on the way back.
+Frames come at 30 a second, images a --shrink-th as wide and high; they are read into memory first.
+A line every --every frames: resident memory beyond that before the first frame, keyframes and
+points the map holds, keyframes made since the line before, and CPU time per frame. Results go to
+OUT as `cohdc slam` writes them; the truth goes forth and back, too. Rolling shutter and the time
+between colour and depth are left out, for they would be wrong on the way back.
 """
 
 import argparse
@@ -35,7 +37,9 @@ RATE = 30  # frames per second
 
 def main() -> None:
     """Load, play, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sequence", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=18_000)
@@ -48,7 +52,9 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     source = ForthAndBack(arguments.sequence, arguments.frames, arguments.shrink, arguments.out)
     options = {"out": arguments.out / "run", "seed": arguments.seed, "features": arguments.features}
-    metrics = run_source(source, method=arguments.method, observers=[Table(arguments.every)], **options)
+    metrics = run_source(
+        source, method=arguments.method, observers=[Table(arguments.every)], **options
+    )
     print(f"ATE RMSE {metrics['ate_m']['rmse']:.4f} m, coverage {100 * metrics['coverage']:.1f} %")
 
 
@@ -70,7 +76,9 @@ class ForthAndBack:
         self.groundtruth: Path | None = None
         if recorded.groundtruth is not None:
             self.groundtruth = out / "groundtruth.txt"
-            write_tum(self.groundtruth, self._truth(read_tum(recorded.groundtruth), np.array(stamps)))
+            write_tum(
+                self.groundtruth, self._truth(read_tum(recorded.groundtruth), np.array(stamps))
+            )
 
     def __len__(self) -> int:
         return len(self._order)
@@ -79,12 +87,20 @@ class ForthAndBack:
         for number, place in enumerate(self._order):
             rgb, depth = self._images[place]
             t = number / RATE
-            yield View(t, f"{t:.6f}", f"{number}", rgb.copy(), depth.astype(np.float32) / self.camera.depth_scale)
+            yield View(
+                t,
+                f"{t:.6f}",
+                f"{number}",
+                rgb.copy(),
+                depth.astype(np.float32) / self.camera.depth_scale,
+            )
 
     def _truth(self, truth: Trajectory, stamps: np.ndarray) -> Trajectory:
         """The pose nearest in time to every image, at the times they are played."""
         row = dict(associate(stamps, truth.stamps, 0.02).tolist())
-        known = [(number / RATE, row[place]) for number, place in enumerate(self._order) if place in row]
+        known = [
+            (number / RATE, row[place]) for number, place in enumerate(self._order) if place in row
+        ]
         times, rows = np.array(known).T
         return Trajectory(times, truth.poses[rows.astype(int)])
 
@@ -100,7 +116,9 @@ def shrunk(camera: Camera, by: int) -> Camera:
 def small(view: View, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:
     """Colour, and depth as it is stored."""
     rgb = cv2.resize(view.rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return rgb, np.rint(view.depth[by // 2 :: by, by // 2 :: by] * camera.depth_scale).astype(np.uint16)
+    return rgb, np.rint(view.depth[by // 2 :: by, by // 2 :: by] * camera.depth_scale).astype(
+        np.uint16
+    )
 
 
 class Table:
@@ -111,7 +129,10 @@ class Table:
         self._frames = self._made = 0
         self._cpu = time.process_time()
         self._start = resident()
-        print("| frames | minutes | MB more | keyframes | points | keyframes made | CPU ms a frame |", flush=True)
+        print(
+            "| frames | minutes | MB more | keyframes | points | keyframes made | CPU ms a frame |",
+            flush=True,
+        )
         print("|---|---|---|---|---|---|---|", flush=True)
 
     def __call__(self, view: View, mask: object, record: FrameRecord, tracker: Tracker) -> None:
@@ -123,7 +144,12 @@ class Table:
         cpu, world = time.process_time(), tracker.map
         points = np.count_nonzero(world.num_observations[: world.size])
         cells = [self._frames, f"{self._frames / RATE / 60:.1f}", f"{resident() - self._start:.0f}"]
-        cells += [len(world.keyframes), points, self._made, f"{1e3 * (cpu - self._cpu) / self._every:.1f}"]
+        cells += [
+            len(world.keyframes),
+            points,
+            self._made,
+            f"{1e3 * (cpu - self._cpu) / self._every:.1f}",
+        ]
         print(f"| {' | '.join(map(str, cells))} |", flush=True)
         self._made, self._cpu = 0, cpu
 

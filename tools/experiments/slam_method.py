@@ -13,11 +13,15 @@ from cohdc_train.slam.config import Method
 def add_method_option(parser: argparse.ArgumentParser) -> None:
     """Gives the arguments a `method`; a switch that there is not ends the tool with what is wrong."""
     words = "as --method.KEY of cohdc slam"
-    parser.add_argument("--method", nargs="+", action=_Switches, default=Method(), metavar="KEY=VALUE", help=words)
+    parser.add_argument(
+        "--method", nargs="+", action=_Switches, default=Method(), metavar="KEY=VALUE", help=words
+    )
 
 
 def chosen_method(switches: Sequence[str]) -> Method:
-    """The method with `KEY=VALUE` switches. Raises ValueError for one it does not have or of another type."""
+    """The method with `KEY=VALUE` switches. Raises ValueError for one it does not have or of
+    another type.
+    """
     types = {field.name: type(field.default) for field in fields(Method)}
     values = {}
     for switch in switches:
@@ -31,7 +35,13 @@ def chosen_method(switches: Sequence[str]) -> Method:
 
 
 class _Switches(argparse.Action):
-    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: Any,
+        values: Any,
+        option: str | None = None,
+    ) -> None:
         try:
             namespace.method = chosen_method(values)
         except ValueError as error:

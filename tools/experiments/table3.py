@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
-"""The paper's Table 3, any set of its columns, at a stated scale: measured scores beside the paper's.
+"""The paper's Table 3, any set of its columns, at a stated scale: measured scores beside the
+paper's.
 
     tools/experiments/table3.py --data ROOT --out DIR [--tests 1 2 7 8 9 10] [--seeds 0 1 2]
         [--epochs 0.05] [--side 0.25] [--jobs 2]
 
---epochs and --side scale the columns' epochs and image sides (anchors with them); the columns' image counts are scaled
-so that the largest, 1014 + 180, becomes all there is. What follows `--` goes to every `cohdc fit`, such as a smaller
-network. Writes table3.md and table3.json to DIR; a second call goes on where the first was stopped.
+--epochs and --side scale the columns' epochs and image sides (anchors with them); the columns'
+image counts are scaled so that the largest, 1014 + 180, becomes all there is. What follows `--`
+goes to every `cohdc fit`, such as a smaller network. Writes table3.md and table3.json to DIR; a
+second call goes on where the first was stopped.
 """
 
 import argparse
@@ -38,9 +40,12 @@ def options_of(test: int, arguments: argparse.Namespace, images: dict[str, int])
     """A column's options of `cohdc fit`, scaled."""
     config = yaml.safe_load((ROOT / f"configs/table3/test{test:02}.yaml").read_text())
     canvas = [round(side * arguments.side) for side in config["data"]["canvas"]]
-    anchors = [max(1, round(side * arguments.side)) for side in config["model"]["network"]["anchor_scales"]]
+    anchors = [
+        max(1, round(side * arguments.side)) for side in config["model"]["network"]["anchor_scales"]
+    ]
     subset = {
-        name: max(1, round(count * images[name] / LARGEST[name])) for name, count in config["data"]["subset"].items()
+        name: max(1, round(count * images[name] / LARGEST[name]))
+        for name, count in config["data"]["subset"].items()
     }
     scaled = [
         f"--config={ROOT / f'configs/table3/test{test:02}.yaml'}",
@@ -57,18 +62,23 @@ def options_of(test: int, arguments: argparse.Namespace, images: dict[str, int])
 def main() -> None:
     """Train, score, print."""
     own, _, fit = " ".join(sys.argv[1:]).partition(" -- ")
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--tests", type=int, nargs="+", choices=PAPER, default=list(PAPER))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--epochs", type=float, default=1.0)
     parser.add_argument("--side", type=float, default=1.0)
-    parser.add_argument("--weights", help="local file in the place of the pre-trained columns' published weights")
+    parser.add_argument(
+        "--weights", help="local file in the place of the pre-trained columns' published weights"
+    )
     parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args(own.split(), argparse.Namespace(fit=fit.split()))
     images = {
-        name: len(json.loads((arguments.data / f"instances_{name}.json").read_text())["images"]) for name in LARGEST
+        name: len(json.loads((arguments.data / f"instances_{name}.json").read_text())["images"])
+        for name in LARGEST
     }
     runs = {
         (test, seed): Run(
@@ -83,7 +93,9 @@ def main() -> None:
     rows, kept = [], []
     for test in arguments.tests:
         of_test = [results[test, seed]["plain"] for seed in arguments.seeds]
-        kept += [{"test": test, "seed": s, **r} for s, r in zip(arguments.seeds, of_test, strict=True)]
+        kept += [
+            {"test": test, "seed": s, **r} for s, r in zip(arguments.seeds, of_test, strict=True)
+        ]
         measured = [spread([scores[name] for scores in of_test]) for name in SCORES]
         rows.append([f"Test {test}", *measured, *(f"{value:.3f}" for value in PAPER[test])])
     names = ("mIoU", "mAP@.5", "mAP@.7")

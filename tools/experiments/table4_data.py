@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""Table 4's real photographs: vehicles and people of two COCO-format folders as one folder of three classes.
+"""Table 4's real photographs: vehicles and people of two COCO-format folders as one folder of three
+classes.
 
     tools/experiments/table4_data.py COCO_SMALL COAD_VEHICLES OUT
 
-COCO's cars, buses and trucks become "vehicle", as the street photographs call them. Every other class is left out;
-photographs of nothing else stay, as background. Images are hard links where possible: do not edit them.
+COCO's cars, buses and trucks become "vehicle", as the street photographs call them. Every other
+class is left out; photographs of nothing else stay, as background. Images are hard links where
+possible: do not edit them.
 """
 
 import sys
@@ -41,14 +43,22 @@ def main() -> None:
                 add(joined, source, name, draft / "images")
             write_json(draft / f"instances_{name}.json", joined)
             split = read_split(name, find_split(draft, name))
-            print(f"{name}: {len(split.images)} images, {sum(len(i.objects) for i in split.images)} objects")
+            print(
+                f"{name}: {len(split.images)} images, {sum(len(i.objects) for i in split.images)} objects"
+            )
 
 
 def add(joined: dict[str, list[Any]], source: Path, name: str, images: Path) -> None:
-    """A source's split at the end of a COCO dict, under new ids and file names; its images beside those there."""
+    """A source's split at the end of a COCO dict, under new ids and file names; its images beside
+    those there.
+    """
     files = find_split(source, name)
     content = read_json(files.annotations)
-    classes = {row["id"]: IDS[CLASSES[row["name"]]] for row in content["categories"] if row["name"] in CLASSES}
+    classes = {
+        row["id"]: IDS[CLASSES[row["name"]]]
+        for row in content["categories"]
+        if row["name"] in CLASSES
+    }
     ids: dict[int, int] = {}
     for row in content["images"]:
         ids[row["id"]] = len(joined["images"]) + 1

@@ -1,6 +1,7 @@
 """Trainings of the experiments, each in its own process; what is scored once is not trained again.
 
-Imported by the tools beside it; runs the checkout's `cohdc fit` and `cohdc validate` with the present interpreter.
+Imported by the tools beside it; runs the checkout's `cohdc fit` and `cohdc validate` with the
+present interpreter.
 """
 
 import json
@@ -37,7 +38,10 @@ class Run:
     def scores(self) -> dict[str, Scores]:
         """Train and score, unless the folder holds the scores of the same options."""
         kept = self.folder / "scores.json"
-        asked = {"options": list(self.options), "scorings": {k: list(v) for k, v in self.scorings.items()}}
+        asked = {
+            "options": list(self.options),
+            "scorings": {k: list(v) for k, v in self.scorings.items()},
+        }
         if kept.is_file() and (known := json.loads(kept.read_text()))["asked"] == asked:
             return known["scores"]
         checkpoint, seconds = train(self.folder, self.data, self.options)
@@ -60,7 +64,9 @@ def run_all(runs: Sequence[Run], jobs: int) -> list[dict[str, Scores]]:
     def one(run: Run) -> dict[str, Scores]:
         scores = run.scores()
         print(
-            f"{run.folder}: " + ", ".join(f"{k} mask AP50 {v['segm_AP50']:.3f}" for k, v in scores.items()), flush=True
+            f"{run.folder}: "
+            + ", ".join(f"{k} mask AP50 {v['segm_AP50']:.3f}" for k, v in scores.items()),
+            flush=True,
         )
         return scores
 

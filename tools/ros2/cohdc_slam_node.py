@@ -5,13 +5,15 @@
         -r color/image:=/camera/color/image_raw -r color/camera_info:=/camera/color/camera_info \
         -r depth/image:=/camera/aligned_depth_to_color/image_raw
 
-Needs rclpy, message_filters, sensor_msgs, geometry_msgs and nav_msgs of a ROS 2 installation, and cohdc-train in the
-same Python. Publishes, in the frame `map` (x forward, y left, z up where the first camera stood): pose
-(geometry_msgs/PoseStamped) per tracked frame, path (nav_msgs/Path) of the keyframes at every new one, and mask
-(sensor_msgs/Image, mono8, 255 = dynamic). A frame that comes while another is worked on replaces the one that waits.
-Ctrl-C ends it and writes what `cohdc slam` writes into `out`.
+Needs rclpy, message_filters, sensor_msgs, geometry_msgs and nav_msgs of a ROS 2 installation, and
+cohdc-train in the same Python. Publishes, in the frame `map` (x forward, y left, z up where the
+first camera stood): pose (geometry_msgs/PoseStamped) per tracked frame, path (nav_msgs/Path) of the
+keyframes at every new one, and mask (sensor_msgs/Image, mono8, 255 = dynamic). A frame that comes
+while another is worked on replaces the one that waits. Ctrl-C ends it and writes what `cohdc slam`
+writes into `out`.
 
-Parameters: model (ONNX or a shipped network's name; empty: no masks), out, cloud (true: cloud.ply too), seed, features.
+Parameters: model (ONNX or a shipped network's name; empty: no masks), out, cloud (true: cloud.ply
+too), seed, features.
 """
 
 import queue
@@ -52,19 +54,35 @@ class SlamNode(Node):
         self._infos: queue.Queue[Any] = queue.Queue()
         self._headers: dict[float, Any] = {}
         topics = ("color/image", "depth/image")
-        inputs = [message_filters.Subscriber(self, Image, name, qos_profile=qos_profile_sensor_data) for name in topics]
+        inputs = [
+            message_filters.Subscriber(self, Image, name, qos_profile=qos_profile_sensor_data)
+            for name in topics
+        ]
         self._pairs = message_filters.ApproximateTimeSynchronizer(inputs, 10, SLOP)
         self._pairs.registerCallback(self._take)
-        self.create_subscription(CameraInfo, "color/camera_info", self._infos.put, qos_profile_sensor_data)
+        self.create_subscription(
+            CameraInfo, "color/camera_info", self._infos.put, qos_profile_sensor_data
+        )
         self._pose = self.create_publisher(PoseStamped, "pose", 10)
         self._path = self.create_publisher(PathMessage, "path", 1)
         self._mask = self.create_publisher(Image, "mask", 1)
 
     def options(self) -> dict[str, Any]:
         """Arguments of run_source from the node's parameters."""
-        defaults = {"model": "", "out": "runs/ros", "cloud": False, "seed": 0, "features": MAX_KEYPOINTS}
-        values = {name: self.declare_parameter(name, default).value for name, default in defaults.items()}
-        return values | {"out": Path(values["out"]), "model": Path(values["model"]) if values["model"] else None}
+        defaults = {
+            "model": "",
+            "out": "runs/ros",
+            "cloud": False,
+            "seed": 0,
+            "features": MAX_KEYPOINTS,
+        }
+        values = {
+            name: self.declare_parameter(name, default).value for name, default in defaults.items()
+        }
+        return values | {
+            "out": Path(values["out"]),
+            "model": Path(values["model"]) if values["model"] else None,
+        }
 
     def camera(self) -> Camera:
         """The camera, as soon as it is told."""
@@ -101,7 +119,9 @@ class SlamNode(Node):
         if pose.T_wc is not None:
             self._pose.publish(stamped(pose.T_wc, self._headers[pose.t].stamp))
 
-    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+    def __call__(
+        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
         """Publish one frame's mask, and the path when it has grown."""
         header = self._headers.pop(view.t)
         if record.pose.keyframe:
@@ -131,7 +151,9 @@ def main() -> None:
     threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
     try:
         options = node.options()
-        run_source(Live(node.camera(), node.frames()), observers=[node], on_pose=node.on_pose, **options)
+        run_source(
+            Live(node.camera(), node.frames()), observers=[node], on_pose=node.on_pose, **options
+        )
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

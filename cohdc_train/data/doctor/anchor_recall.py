@@ -8,11 +8,17 @@ from numpy.typing import NDArray
 
 STRIDES = (4, 8, 16, 32, 64)  # px, of the pyramid's levels
 RATIOS = (0.5, 1.0, 2.0)  # height / width
-SIZES = {"small": (0.0, 32.0), "medium": (32.0, 96.0), "large": (96.0, np.inf)}  # px, COCO's, of sqrt(area)
+SIZES = {
+    "small": (0.0, 32.0),
+    "medium": (32.0, 96.0),
+    "large": (96.0, np.inf),
+}  # px, COCO's, of sqrt(area)
 
 
 class AnchorRecall(NamedTuple):
-    """Objects of one size on the canvas, and the share of them that an anchor covers at IoU .5 and .7."""
+    """Objects of one size on the canvas, and the share of them that an anchor covers at IoU .5 and
+    .7.
+    """
 
     size: str
     objects: int
@@ -20,8 +26,11 @@ class AnchorRecall(NamedTuple):
     at_70: float
 
 
-def best_overlap(boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]) -> NDArray[np.float64]:
-    """The largest IoU of each box with an anchor of torchvision's grid: one scale per level from stride 4, 3 ratios.
+def best_overlap(
+    boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]
+) -> NDArray[np.float64]:
+    """The largest IoU of each box with an anchor of torchvision's grid: one scale per level from
+    stride 4, 3 ratios.
 
     boxes: [N, 4] xyxy, px on the canvas; canvas: (height, width), px. Returns [N].
     """
@@ -31,13 +40,20 @@ def best_overlap(boxes: NDArray[np.float64], scales: Sequence[int], canvas: tupl
         for ratio in RATIOS:
             # torchvision rounds half an anchor's sides to whole px
             half = np.round(np.array([scale / np.sqrt(ratio), scale * np.sqrt(ratio)]) / 2)
-            centre = np.round((boxes[:, :2] + boxes[:, 2:]) / 2 / stride).clip(0, steps - 1) * stride
-            best = np.maximum(best, _iou(boxes, np.concatenate([centre - half, centre + half], axis=1)))
+            centre = (
+                np.round((boxes[:, :2] + boxes[:, 2:]) / 2 / stride).clip(0, steps - 1) * stride
+            )
+            best = np.maximum(
+                best, _iou(boxes, np.concatenate([centre - half, centre + half], axis=1))
+            )
     return best
 
 
-def recall(boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]) -> list[AnchorRecall]:
-    """Anchor-to-object recall by size. boxes, canvas: as `best_overlap` takes them; sizes without objects are left out.
+def recall(
+    boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]
+) -> list[AnchorRecall]:
+    """Anchor-to-object recall by size. boxes, canvas: as `best_overlap` takes them; sizes without
+    objects are left out.
 
     RPN training calls an anchor positive from IoU .7, and takes an object's best one in any case.
     """
@@ -47,7 +63,11 @@ def recall(boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int,
     for size, (low, high) in {**SIZES, "all": (0.0, np.inf)}.items():
         chosen = overlap[(side >= low) & (side < high)]
         if len(chosen):
-            rows.append(AnchorRecall(size, len(chosen), float((chosen >= 0.5).mean()), float((chosen >= 0.7).mean())))
+            rows.append(
+                AnchorRecall(
+                    size, len(chosen), float((chosen >= 0.5).mean()), float((chosen >= 0.7).mean())
+                )
+            )
     return rows
 
 

@@ -1,4 +1,6 @@
-"""One annotation of a COCO-format file under the magnifying glass: what is wrong with it, and its mended row."""
+"""One annotation of a COCO-format file under the magnifying glass: what is wrong with it, and its
+mended row.
+"""
 
 from typing import Any, NamedTuple
 
@@ -9,13 +11,18 @@ from shapely import Polygon, box, clip_by_rect, get_parts
 from cohdc_train.data.annotations import fills, is_crowd, is_numbers
 
 _TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
-_DISAGREE, _AGREE = 0.5, 0.9  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
+_DISAGREE, _AGREE = (
+    0.5,
+    0.9,
+)  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
 _TINY = 4  # px
 Box = tuple[float, float, float, float]
 
 
 class Examined(NamedTuple):
-    """findings: kinds. row: the mended annotation, None when it has to go. shape: its compressed RLE, None likewise."""
+    """findings: kinds. row: the mended annotation, None when it has to go. shape: its compressed
+    RLE, None likewise.
+    """
 
     findings: list[str]
     row: dict[str, Any] | None
@@ -37,7 +44,9 @@ def examine(row: dict[str, Any], height: int, width: int) -> Examined:
     findings += kinds
     if mended is None:
         return Examined(findings, None, None)
-    shape = mended if isinstance(mended, dict) else rle.merge(rle.frPyObjects(mended, height, width))
+    shape = (
+        mended if isinstance(mended, dict) else rle.merge(rle.frPyObjects(mended, height, width))
+    )
     pixels = int(rle.area(shape))
     if pixels == 0:
         return Examined([*findings, "contour-empty"], None, None)
@@ -50,19 +59,28 @@ def examine(row: dict[str, Any], height: int, width: int) -> Examined:
     if not isinstance(area, int | float) or not pixels / 2 <= area <= pixels * 2:
         findings += ["area-wrong"] if area is not None and pixels >= _TINY else []
         area = float(pixels)
-    return Examined(findings, row | {"segmentation": mended, "bbox": list(bounds), "area": area}, shape)
+    return Examined(
+        findings, row | {"segmentation": mended, "bbox": list(bounds), "area": area}, shape
+    )
 
 
 def fits(row: dict[str, Any], height: int, width: int) -> bool:
-    """Whether an annotation could be of an image of this size: its RLE's size is the same, or its points lie inside."""
+    """Whether an annotation could be of an image of this size: its RLE's size is the same, or its
+    points lie inside.
+    """
     segmentation = row.get("segmentation") or []
     if isinstance(segmentation, dict):
         return list(segmentation.get("size", ())) == [height, width]
     try:
-        points = np.concatenate([np.asarray(part, dtype=float).reshape(-1, 2) for part in segmentation])
+        points = np.concatenate(
+            [np.asarray(part, dtype=float).reshape(-1, 2) for part in segmentation]
+        )
     except ValueError:
         return False
-    return bool((points >= -_TOLERANCE).all() and (points <= (width + _TOLERANCE, height + _TOLERANCE)).all())
+    return bool(
+        (points >= -_TOLERANCE).all()
+        and (points <= (width + _TOLERANCE, height + _TOLERANCE)).all()
+    )
 
 
 def _mend_segmentation(given: Any, height: int, width: int) -> tuple[list[str], Any]:
@@ -107,23 +125,35 @@ def _fault(part: Any) -> str:
     return "contour-short" if len(part) < 6 else ""
 
 
-def _clipped(part: list[float], outline: Polygon, height: int, width: int) -> list[list[float]] | None:
-    """What lies inside of the image of a polygon that reaches out of it; None when it does not reach out.
+def _clipped(
+    part: list[float], outline: Polygon, height: int, width: int
+) -> list[list[float]] | None:
+    """What lies inside of the image of a polygon that reaches out of it; None when it does not
+    reach out.
 
     A crossing polygon, which shapely cannot cut, has its points moved to the edge.
     """
     x0, y0, x1, y1 = outline.bounds
-    if x0 >= -_TOLERANCE and y0 >= -_TOLERANCE and x1 <= width + _TOLERANCE and y1 <= height + _TOLERANCE:
+    if (
+        x0 >= -_TOLERANCE
+        and y0 >= -_TOLERANCE
+        and x1 <= width + _TOLERANCE
+        and y1 <= height + _TOLERANCE
+    ):
         return None
     if not outline.is_valid:
         points = np.clip(np.asarray(part, dtype=float).reshape(-1, 2), 0, (width, height))
         return [points.ravel().tolist()]
     inside = clip_by_rect(outline, 0, 0, width, height)
-    pieces = [piece for piece in get_parts(inside) if piece.geom_type == "Polygon" and piece.area > 0]
+    pieces = [
+        piece for piece in get_parts(inside) if piece.geom_type == "Polygon" and piece.area > 0
+    ]
     return [np.asarray(piece.exterior.coords)[:-1].ravel().tolist() for piece in pieces]
 
 
-def _mend_rle(given: dict[str, Any], height: int, width: int) -> tuple[list[str], dict[str, Any] | None]:
+def _mend_rle(
+    given: dict[str, Any], height: int, width: int
+) -> tuple[list[str], dict[str, Any] | None]:
     size, counts = given.get("size"), given.get("counts")
     if not is_numbers(size, 2) or not isinstance(counts, str | bytes | list):
         return ["contour-format"], None
@@ -135,7 +165,9 @@ def _mend_rle(given: dict[str, Any], height: int, width: int) -> tuple[list[str]
 
 
 def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str], Box]:
-    """Kinds of findings and the box to keep: the annotated one, clipped, unless the contour's is the better."""
+    """Kinds of findings and the box to keep: the annotated one, clipped, unless the contour's is
+    the better.
+    """
     if given is None:
         return ["box-missing"], tight
     if not is_numbers(given, 4):
@@ -145,7 +177,12 @@ def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str
         return ["box-inverted"], tight
     if w == 0 or h == 0:
         return ["box-degenerate"], tight
-    inside = (max(x, 0.0), max(y, 0.0), min(x + w, width) - max(x, 0.0), min(y + h, height) - max(y, 0.0))
+    inside = (
+        max(x, 0.0),
+        max(y, 0.0),
+        min(x + w, width) - max(x, 0.0),
+        min(y + h, height) - max(y, 0.0),
+    )
     outside = max(-x, -y, x + w - width, y + h - height) > _TOLERANCE
     if min(inside[2:]) > 0 and (_iou(inside, tight) >= _DISAGREE or _near(inside, tight)):
         return ["box-outside"] if outside else [], inside
@@ -161,7 +198,9 @@ def _iou(a: Box, b: Box) -> float:
 
 
 def _near(a: Box, b: Box) -> bool:
-    """Whether no edge is off by more than the tolerance: of an object of a few px, one px is half the IoU."""
+    """Whether no edge is off by more than the tolerance: of an object of a few px, one px is half
+    the IoU.
+    """
     edges = [(v[0], v[1], v[0] + v[2], v[1] + v[3]) for v in (a, b)]
     return all(abs(one - other) <= _TOLERANCE for one, other in zip(*edges, strict=True))
 
@@ -169,4 +208,7 @@ def _near(a: Box, b: Box) -> bool:
 def _text(encoded: dict[str, Any]) -> dict[str, Any]:
     """A compressed RLE whose counts are text, as JSON wants them."""
     counts = encoded["counts"]
-    return {"size": list(encoded["size"]), "counts": counts.decode() if isinstance(counts, bytes) else counts}
+    return {
+        "size": list(encoded["size"]),
+        "counts": counts.decode() if isinstance(counts, bytes) else counts,
+    }

@@ -32,15 +32,18 @@ def doctor(
     canvas: tuple[int, int] = (800, 1024),
     anchor_scales: tuple[int, ...] = (32, 64, 128, 256),
 ) -> None:
-    """Look for everything in a COCO-format folder that would stop training or make it learn or score the wrong thing.
+    """Look for everything in a COCO-format folder that would stop training or make it learn or
+    score the wrong thing.
 
-    Prints every finding with its count, three places and the mend, then the folder's statistics. Exit code 1 when
-    there is an error among the findings.
+    Prints every finding with its count, three places and the mend, then the folder's statistics.
+    Exit code 1 when there is an error among the findings.
 
     Args:
         root: the folder, in any of the usual layouts.
-        fix: folder to write mended annotation files into, with `removed.json`: every row that is left out, and why.
-        out: folder to write `findings.json` and `annotations.jpg`, a grid of annotated images, into.
+        fix: folder to write mended annotation files into, with `removed.json`: every row that is
+            left out, and why.
+        out: folder to write `findings.json` and `annotations.jpg`, a grid of annotated images,
+            into.
         canvas: height and width, px, for the anchors' recall.
         anchor_scales: side of the anchors, px, one per pyramid level from stride 4.
     """
@@ -48,7 +51,9 @@ def doctor(
     _compare(*splits)
     for split in splits:
         listed = f"{len(split.content['images'])} images, {len(split.content['annotations'])} annotations"
-        print(f"{split.name}: {split.files.annotations}: {listed} can be used, {len(split.removed)} rows cannot")
+        print(
+            f"{split.name}: {split.files.annotations}: {listed} can be used, {len(split.removed)} rows cannot"
+        )
         print("\n".join(split.findings.lines()) or "  nothing found")
     if fix is not None:
         _write_mended(splits, fix)
@@ -59,7 +64,9 @@ def doctor(
     count_of = sum(len(where) for kinds in wrong.values() for where in kinds.values())
     if count_of:
         kinds = ", ".join(sorted({kind for found in wrong.values() for kind in found}))
-        raise DataError(f"{root}: {count_of} errors ({kinds}): training would stop, or learn or score the wrong thing")
+        raise DataError(
+            f"{root}: {count_of} errors ({kinds}): training would stop, or learn or score the wrong thing"
+        )
     readable = [read_split(split.name, split.files) for split in splits]
     _print_statistics(readable, canvas, anchor_scales)
     if out is not None:
@@ -67,7 +74,8 @@ def doctor(
 
 
 def stats(root: Path, classes: list[str] | None = None) -> None:
-    """Print what the splits of a COCO-format folder hold: images, objects, crowd, what had to be dropped or clipped.
+    """Print what the splits of a COCO-format folder hold: images, objects, crowd, what had to be
+    dropped or clipped.
 
     Args:
         root: the folder, in any of the usual layouts.
@@ -78,7 +86,9 @@ def stats(root: Path, classes: list[str] | None = None) -> None:
         for name, value in count(split).items():
             print(f"{split.name:<6}{name:<24}{value}")
     if set(splits[0].class_names) != set(splits[1].class_names):
-        raise DataError(f"{root}: the classes of train and val differ: {splits[0].class_names} {splits[1].class_names}")
+        raise DataError(
+            f"{root}: the classes of train and val differ: {splits[0].class_names} {splits[1].class_names}"
+        )
 
 
 def count(split: CocoSplit) -> dict[str, Any]:
@@ -100,13 +110,18 @@ def count(split: CocoSplit) -> dict[str, Any]:
 
 def summary(split: CocoSplit) -> str:
     """The counts of one split that are not zero, in one line."""
-    shown = [f"{name} {value}" for name, value in count(split).items() if name != "annotations" and value]
+    shown = [
+        f"{name} {value}" for name, value in count(split).items() if name != "annotations" and value
+    ]
     return f"{split.name}: {'; '.join(shown[:_SHOWN])}" + ("; ..." if len(shown) > _SHOWN else "")
 
 
 def _compare(train: Inspection, val: Inspection) -> None:
     """Findings between the splits: classes, and images that are in both."""
-    names = [{row["id"]: str(row["name"]) for row in split.content["categories"]} for split in (train, val)]
+    names = [
+        {row["id"]: str(row["name"]) for row in split.content["categories"]}
+        for split in (train, val)
+    ]
     for here, there, split in ((names[0], names[1], train), (names[1], names[0], val)):
         for missing in sorted(set(here.values()) - set(there.values())):
             split.findings.add("classes-differ", missing)
@@ -137,19 +152,25 @@ def _write_mended(splits: Sequence[Inspection], folder: Path) -> None:
     options = []
     for split, path in zip(splits, paths, strict=True):
         write_json(path, split.content)
-        options += [f"--data.paths.{split.name}_json {path} --data.paths.{split.name}_images {split.files.images}"]
+        options += [
+            f"--data.paths.{split.name}_json {path} --data.paths.{split.name}_images {split.files.images}"
+        ]
     write_json(folder / "removed.json", {split.name: split.removed for split in splits})
     print(f"mended: cohdc fit {' '.join(options)}")
 
 
-def _print_statistics(splits: Sequence[CocoSplit], canvas: tuple[int, int], scales: Sequence[int]) -> None:
+def _print_statistics(
+    splits: Sequence[CocoSplit], canvas: tuple[int, int], scales: Sequence[int]
+) -> None:
     for split in splits:
         print(summary(split))
     print(f"Table 3 columns it has images enough for: {', '.join(_columns(splits)) or 'none'}")
     print(f"anchors {list(scales)} on a canvas of {canvas[0]}x{canvas[1]} px, objects of train:")
     boxes = _boxes(splits[0], canvas)
     for row in recall(boxes, scales, canvas):
-        print(f"  {row.size:<8}{row.objects:>7} objects   IoU >= .5: {row.at_50:6.1%}   >= .7: {row.at_70:6.1%}")
+        print(
+            f"  {row.size:<8}{row.objects:>7} objects   IoU >= .5: {row.at_50:6.1%}   >= .7: {row.at_70:6.1%}"
+        )
 
 
 def _boxes(split: CocoSplit, canvas: tuple[int, int]) -> Any:
@@ -167,7 +188,9 @@ def _columns(splits: Sequence[CocoSplit]) -> list[str]:
     """Names of the Table 3 configurations whose subsets the splits can give."""
     names = []
     for number in _TABLE3:
-        config = yaml.safe_load(config_path(f"table3/test{number:02}.yaml").read_text(encoding="utf-8"))
+        config = yaml.safe_load(
+            config_path(f"table3/test{number:02}.yaml").read_text(encoding="utf-8")
+        )
         wanted = config["data"]["subset"]
         if all(wanted.get(split.name, 0) <= len(split.images) for split in splits):
             names.append(f"test{number:02}")

@@ -16,8 +16,9 @@ _FILL = 0.45
 
 
 def draw_grid(splits: Sequence[CocoSplit], path: Path, columns: int = 4, rows: int = 3) -> None:
-    """Write a JPEG of images drawn at random, always the same ones, half of them of each split; objects are tinted by
-    class and outlined, crowds white. Raises DataError naming an image that cannot be read."""
+    """Write a JPEG of images drawn at random, always the same ones, half of them of each split;
+    objects are tinted by class and outlined, crowds white. Raises DataError naming an image that
+    cannot be read."""
     tiles = []
     for split in splits:
         filled = [image for image in split.images if image.objects]
@@ -35,7 +36,9 @@ def _tile(image: CocoImage, split: CocoSplit) -> NDArray[np.uint8]:
     for o in image.objects:
         if not o.segmentation:
             continue
-        mask = cv2.resize(o.mask(image.height, image.width), size, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
+        mask = cv2.resize(
+            o.mask(image.height, image.width), size, interpolation=cv2.INTER_NEAREST
+        ).astype(np.uint8)
         colour = (255, 255, 255) if o.crowd else _colour(o.label)
         tint(shown, mask, colour, _FILL)
     tile = np.zeros((*_TILE, 3), np.uint8)
@@ -45,23 +48,29 @@ def _tile(image: CocoImage, split: CocoSplit) -> NDArray[np.uint8]:
 
 
 def read_fitted(image: CocoImage, tile: tuple[int, int]) -> NDArray[np.uint8]:
-    """The image, BGR, as large as fits into (height, width) px. Raises DataError when it cannot be read."""
+    """The image, BGR, as large as fits into (height, width) px. Raises DataError when it cannot be
+    read.
+    """
     pixels = np.ascontiguousarray(read_image(image)[:, :, ::-1])
     scale = min(tile[0] / image.height, tile[1] / image.width)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def tint(shown: NDArray[np.uint8], mask: NDArray[np.uint8], colour: tuple[int, int, int], fill: float) -> None:
-    """Colour and outline, in place, what a mask covers. shown: [H, W, 3]; mask: [H, W] of 0 and 1; fill: share of the
-    colour, 0..1."""
+def tint(
+    shown: NDArray[np.uint8], mask: NDArray[np.uint8], colour: tuple[int, int, int], fill: float
+) -> None:
+    """Colour and outline, in place, what a mask covers. shown: [H, W, 3]; mask: [H, W] of 0 and 1;
+    fill: share of the colour, 0..1."""
     inside = mask.astype(bool)
     shown[inside] = ((1 - fill) * shown[inside] + fill * np.array(colour)).astype(np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(shown, outlines, -1, colour, 1)
 
 
-def write_outlined(shown: NDArray[np.uint8], text: str, place: tuple[int, int], scale: float = 0.4) -> None:
+def write_outlined(
+    shown: NDArray[np.uint8], text: str, place: tuple[int, int], scale: float = 0.4
+) -> None:
     """White letters with a black rim, in place. place: (x, y) of the text's lower left corner, px."""
     for thick, ink in ((3, (0, 0, 0)), (1, (255, 255, 255))):
         cv2.putText(shown, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, thick, cv2.LINE_AA)

@@ -53,7 +53,9 @@ class Inspection:
 
 
 def inspect(name: str, files: SplitPaths) -> Inspection:
-    """Look at every category, image and annotation of a split. Raises DataError when the file is not COCO format."""
+    """Look at every category, image and annotation of a split. Raises DataError when the file is
+    not COCO format.
+    """
     given = read_json(files.annotations)
     split = Inspection(name, files)
     categories, join = _categories(split, given["categories"])
@@ -87,7 +89,11 @@ def _categories(split: Inspection, given: Sequence[Any]) -> tuple[list[Row], dic
     first: dict[str, int] = {}
     join: dict[int, int] = {}
     for row in given:
-        if not isinstance(row, dict) or not isinstance(row.get("id"), int) or not str(row.get("name") or "").strip():
+        if (
+            not isinstance(row, dict)
+            or not isinstance(row.get("id"), int)
+            or not str(row.get("name") or "").strip()
+        ):
             split.fault("category-broken", f"{row!r:.40}", row)
             continue
         name, number = str(row["name"]), row["id"]
@@ -99,15 +105,24 @@ def _categories(split: Inspection, given: Sequence[Any]) -> tuple[list[Row], dic
         else:
             kept[number], first[name] = row, number
     if sorted(kept) != list(range(1, len(kept) + 1)):
-        split.findings.add("category-gap", ", ".join(map(str, sorted(kept)[:8])) + (" ..." if len(kept) > 8 else ""))
+        split.findings.add(
+            "category-gap",
+            ", ".join(map(str, sorted(kept)[:8])) + (" ..." if len(kept) > 8 else ""),
+        )
     return list(kept.values()), join
 
 
-def _images(split: Inspection, given: Sequence[Any], rows: Sequence[Row]) -> tuple[dict[Any, Row], dict[Any, Any]]:
+def _images(
+    split: Inspection, given: Sequence[Any], rows: Sequence[Row]
+) -> tuple[dict[Any, Row], dict[Any, Any]]:
     """The usable images by id, and under which id each image that is listed twice goes on."""
     by_id: dict[Any, list[Row]] = defaultdict(list)
     for row in given:
-        if not isinstance(row, dict) or not row.get("file_name") or not _whole(row, "id", "width", "height"):
+        if (
+            not isinstance(row, dict)
+            or not row.get("file_name")
+            or not _whole(row, "id", "width", "height")
+        ):
             split.fault("image-broken", f"{row!r:.60}", row)
         elif row not in by_id[row["id"]]:
             by_id[row["id"]].append(row)
@@ -178,7 +193,11 @@ def _sized(split: Inspection, row: Row, file: ImageFile, annotations: Sequence[R
 
 
 def _annotations(
-    split: Inspection, rows: Sequence[Row], images: dict[Any, Row], categories: set[int], listed: set[Any]
+    split: Inspection,
+    rows: Sequence[Row],
+    images: dict[Any, Row],
+    categories: set[int],
+    listed: set[Any],
 ) -> list[Row]:
     """The mended annotations. listed: ids of all images of the file, usable or not."""
     per_image: dict[Any, list[tuple[Row, dict[str, Any] | None]]] = defaultdict(list)
@@ -201,11 +220,17 @@ def _annotations(
             split.remove(findings[-1], row)
         else:
             per_image[image["id"]].append((mended, shape))
-    kept = [row for number, pairs in per_image.items() for row in _without_twins(split, images[number], pairs)]
+    kept = [
+        row
+        for number, pairs in per_image.items()
+        for row in _without_twins(split, images[number], pairs)
+    ]
     return _numbered(split, kept, images)
 
 
-def _without_twins(split: Inspection, image: Row, pairs: Sequence[tuple[Row, dict[str, Any] | None]]) -> list[Row]:
+def _without_twins(
+    split: Inspection, image: Row, pairs: Sequence[tuple[Row, dict[str, Any] | None]]
+) -> list[Row]:
     """The annotations of one image without those that repeat an earlier one of their class."""
     twins: set[int] = set()
     classes: dict[Any, list[int]] = defaultdict(list)

@@ -1,4 +1,6 @@
-"""What a foreign annotation format holds before it becomes COCO: images, objects, and what was left out (no torch)."""
+"""What a foreign annotation format holds before it becomes COCO: images, objects, and what was left
+out (no torch).
+"""
 
 import math
 import os
@@ -21,7 +23,8 @@ _SAGITTA = 0.05  # px by which an arc may leave the chord that stands for it
 class SourceObject(NamedTuple):
     """One object.
 
-    name: its class. segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE. where: file and row.
+    name: its class. segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE. where:
+    file and row.
     """
 
     name: str
@@ -94,7 +97,9 @@ def annotation_files(root: Path) -> list[Path]:
         return [root]
     files = _below(root, {".json"})
     if not files:
-        raise DataError(f"{root}: {'no JSON file below it' if root.is_dir() else 'no such file or folder'}")
+        raise DataError(
+            f"{root}: {'no JSON file below it' if root.is_dir() else 'no such file or folder'}"
+        )
     return files
 
 
@@ -107,7 +112,9 @@ def leave_out_strays(root: Path, source: Source, why: str) -> None:
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
-    """(number, text) of the lines that are not empty. Raises DataError naming the file when it cannot be read."""
+    """(number, text) of the lines that are not empty. Raises DataError naming the file when it
+    cannot be read.
+    """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except FileNotFoundError as error:
@@ -118,7 +125,8 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceImage:
-    """The image of a file, without objects. annotated: (width, height), px, where the format tells it.
+    """The image of a file, without objects. annotated: (width, height), px, where the format tells
+    it.
 
     Annotation tools show the upright image, so that is what the objects are drawn on, unless the
     annotated size is that of the stored pixels only.
@@ -136,7 +144,9 @@ def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceIm
 
 
 def numbers(values: Any, count: int | None = None) -> list[float]:
-    """The values as finite floats. Raises TypeError or ValueError when they are not, or not `count` of them."""
+    """The values as finite floats. Raises TypeError or ValueError when they are not, or not `count`
+    of them.
+    """
     try:
         found = [float(value) for value in values]
     except OverflowError as error:
@@ -173,17 +183,23 @@ def encode(mask: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def join(parts: Sequence[Any], height: int, width: int) -> Any:
-    """One segmentation of an object's polygons [x, y, ...] and RLEs: polygons, or an RLE where there is one among them.
+    """One segmentation of an object's polygons [x, y, ...] and RLEs: polygons, or an RLE where
+    there is one among them.
 
     height, width: px, of the image.
     """
     if all(isinstance(part, list) for part in parts):
         return list(parts)
-    encoded = [rle.frPyObjects([part], height, width)[0] if isinstance(part, list) else part for part in parts]
+    encoded = [
+        rle.frPyObjects([part], height, width)[0] if isinstance(part, list) else part
+        for part in parts
+    ]
     return rle.merge(encoded)
 
 
 def _below(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
     """Files of these suffixes below a folder, sorted, but those whose path has a hidden part."""
     found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
-    return sorted(path for path in found if not any(p.startswith(".") for p in path.relative_to(root).parts))
+    return sorted(
+        path for path in found if not any(p.startswith(".") for p in path.relative_to(root).parts)
+    )

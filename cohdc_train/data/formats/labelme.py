@@ -42,9 +42,9 @@ _NEEDS = {
 def read_labelme(root: Path) -> Source:
     """A folder of images and labelme's JSON files, or one such file.
 
-    Polygons, rectangles, circles and masks become objects, those with the same label and `group_id` one object;
-    shapes of other types are left out and counted, and so are images without a JSON. Folders named
-    train, val and test are the source's own split.
+    Polygons, rectangles, circles and masks become objects, those with the same label and `group_id`
+    one object; shapes of other types are left out and counted, and so are images without a JSON.
+    Folders named train, val and test are the source's own split.
     Raises DataError in one line naming the file and the shape.
     """
     source = Source()
@@ -94,13 +94,19 @@ def _embedded(path: Path, content: dict[str, Any] | None = None) -> bytes:
     return base64.b64decode((content or load_json(path))["imageData"], validate=True)
 
 
-def _objects(path: Path, shapes: Sequence[Any], image: SourceImage, source: Source) -> list[SourceObject]:
+def _objects(
+    path: Path, shapes: Sequence[Any], image: SourceImage, source: Source
+) -> list[SourceObject]:
     """The objects of one file, shapes of a group joined."""
     groups: dict[tuple[str, str], list[Any]] = {}
     where_of: dict[tuple[str, str], str] = {}
     for number, shape in enumerate(shapes, start=1):
         where = f"{path}: shape {number}"
-        if not isinstance(shape, dict) or not isinstance(shape.get("label"), str) or not shape["label"].strip():
+        if (
+            not isinstance(shape, dict)
+            or not isinstance(shape.get("label"), str)
+            or not shape["label"].strip()
+        ):
             raise DataError(f"{where}: no label")
         part = _outline(shape, image, where)
         if part is None:
@@ -111,7 +117,8 @@ def _objects(path: Path, shapes: Sequence[Any], image: SourceImage, source: Sour
         groups.setdefault(key, []).append(part)
         where_of.setdefault(key, where)
     return [
-        SourceObject(key[0], join(parts, image.height, image.width), where_of[key]) for key, parts in groups.items()
+        SourceObject(key[0], join(parts, image.height, image.width), where_of[key])
+        for key, parts in groups.items()
     ]
 
 

@@ -1,4 +1,6 @@
-"""VGG Image Annotator: a project of version 2, or exported annotations of versions 1 and 2, as JSON (no torch)."""
+"""VGG Image Annotator: a project of version 2, or exported annotations of versions 1 and 2, as JSON
+(no torch).
+"""
 
 import contextlib
 import os
@@ -34,10 +36,11 @@ Row = dict[str, Any]
 def read_via(root: Path, attribute: str | None = None, names: Path | None = None) -> Source:
     """A folder of images and VIA's JSON files, or one such file with its images beside it.
 
-    attribute: the region attribute that holds the class; the only one when there is only one. names: a file with one
-    class for all regions, instead. Polylines, points and regions without exactly one class are left out and counted.
-    Folders, or JSON files, named train, val and test are the source's own split.
-    Raises DataError in one line naming the file, the image and the region, or the attributes to choose from.
+    attribute: the region attribute that holds the class; the only one when there is only one.
+    names: a file with one class for all regions, instead. Polylines, points and regions without
+    exactly one class are left out and counted. Folders, or JSON files, named train, val and test
+    are the source's own split. Raises DataError in one line naming the file, the image and the
+    region, or the attributes to choose from.
     """
     source = Source()
     contents = {path: list(_entries(path)) for path in annotation_files(root)}
@@ -96,27 +99,42 @@ def _class_attribute(
     root: Path, entries: Sequence[Row], attribute: str | None, names: Path | None
 ) -> tuple[str, str | None]:
     """The attribute that holds the class; or "" and the class of all regions."""
-    found = {name for entry in entries for region in _regions(entry) for name in region["region_attributes"]}
+    found = {
+        name
+        for entry in entries
+        for region in _regions(entry)
+        for name in region["region_attributes"]
+    }
     candidates = ", ".join(sorted(found))
     if names is not None and attribute is None:
         lines = [text for _, text in read_lines(names)]
         if len(lines) != 1:
-            raise DataError(f"{names}: {len(lines)} classes; --names gives all regions one, --attribute each its own")
+            raise DataError(
+                f"{names}: {len(lines)} classes; --names gives all regions one, --attribute each its own"
+            )
         return "", lines[0]
     if attribute is not None:
         if attribute not in found:
-            raise DataError(f"{root}: no region attribute {attribute!r}; there is {candidates or 'none'}")
+            raise DataError(
+                f"{root}: no region attribute {attribute!r}; there is {candidates or 'none'}"
+            )
         return attribute, None
     if len(found) > 1:
-        raise DataError(f"{root}: several region attributes, name the class's with --attribute: {candidates}")
+        raise DataError(
+            f"{root}: several region attributes, name the class's with --attribute: {candidates}"
+        )
     if not found:
-        raise DataError(f"{root}: no region attribute to take the class from; name it in a file, --names FILE")
+        raise DataError(
+            f"{root}: no region attribute to take the class from; name it in a file, --names FILE"
+        )
     return found.pop(), None
 
 
 def _image(path: Path, folder: str, name: str) -> SourceImage:
     places = [path.parent / name, path.parent / folder / name]
-    file = next((place for place in places if os.path.isfile(place)), None)  # False for a name too long for a file
+    file = next(
+        (place for place in places if os.path.isfile(place)), None
+    )  # False for a name too long for a file
     if file is None:
         raise DataError(f"{path}: image {name!r:.200} is not beside it")
     return open_image(file)
@@ -135,7 +153,9 @@ def _objects(
         if kind not in _NEEDS:
             source.leave_out(f"region of shape {kind!r}", here)
         elif len(names) != 1:
-            source.leave_out("region of several classes" if names else f"region without {attribute!r}", here)
+            source.leave_out(
+                "region of several classes" if names else f"region without {attribute!r}", here
+            )
         else:
             objects.append(SourceObject(names[0], [_outline(shape, here)], here))
     return objects
@@ -153,7 +173,9 @@ def _outline(shape: Row, where: str) -> list[float]:
     kind = shape["name"]
     try:
         if kind == "polygon":
-            points = zip(numbers(shape["all_points_x"]), numbers(shape["all_points_y"]), strict=True)
+            points = zip(
+                numbers(shape["all_points_x"]), numbers(shape["all_points_y"]), strict=True
+            )
             return [value for point in points for value in point]
         values = numbers(shape[key] for key in _NEEDS[kind])
         if kind == "rect":

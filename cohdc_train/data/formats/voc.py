@@ -1,4 +1,6 @@
-"""Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them (no torch)."""
+"""Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them (no
+torch).
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,7 +36,9 @@ Labels = NDArray[np.int32]
 
 
 class ClassTable(NamedTuple):
-    """names: of class i + 1 at index i. colours: 0xRRGGBB -> class (0 background, 255 void). painted: a file's."""
+    """names: of class i + 1 at index i. colours: 0xRRGGBB -> class (0 background, 255 void).
+    painted: a file's.
+    """
 
     names: tuple[str, ...]
     colours: dict[int, int]
@@ -42,7 +46,8 @@ class ClassTable(NamedTuple):
 
 
 def read_voc(root: Path, names: Path | None = None) -> Source:
-    """JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/ with train.txt and val.txt.
+    """JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/ with
+    train.txt and val.txt.
 
     Where there is no such split, trainval.txt or CVAT's default.txt is taken. The images of
     test.txt are left out and counted, unless val.txt has them too. names: a file with a class per
@@ -51,7 +56,9 @@ def read_voc(root: Path, names: Path | None = None) -> Source:
     the order of the names.
     Raises DataError in one line naming the file and the line.
     """
-    table = _class_table(names or (root / "labelmap.txt" if (root / "labelmap.txt").is_file() else None))
+    table = _class_table(
+        names or (root / "labelmap.txt" if (root / "labelmap.txt").is_file() else None)
+    )
     source = Source(class_names=table.names)
     pictures = {
         path.relative_to(root / "JPEGImages").with_suffix("").as_posix(): path
@@ -112,7 +119,11 @@ def _class_table(path: Path | None) -> ClassTable:
             continue
         known = 0 if name in _BACKGROUND else _VOID if name in _IGNORED else len(names) + 1
         if not name or name in names:
-            raise DataError(f"{path}:{number}: class {name!r} is listed twice" if name else f"{path}:{number}: no name")
+            raise DataError(
+                f"{path}:{number}: class {name!r} is listed twice"
+                if name
+                else f"{path}:{number}: no name"
+            )
         if known == len(names) + 1:
             names.append(name)
         words = rest.partition(":")[0].split(",")
@@ -122,7 +133,9 @@ def _class_table(path: Path | None) -> ClassTable:
             raise DataError(f"{path}:{number}: not name:R,G,B") from error
         painted |= bool(rest.strip(": "))
         if 0 < colours.get(colour, 0) < _VOID:
-            raise DataError(f"{path}:{number}: {name} has the colour of {names[colours[colour] - 1]}")
+            raise DataError(
+                f"{path}:{number}: {name} has the colour of {names[colours[colour] - 1]}"
+            )
         colours[colour] = known
     if not 0 < len(names) < _VOID:
         raise DataError(f"{path}: {len(names)} classes; 1 to {_VOID - 1} can be told apart")
@@ -134,20 +147,28 @@ def _packed(red: int, green: int, blue: int) -> int:
 
 
 def _voc_colour(index: int) -> int:
-    """VOC's colour of a class: every third bit of the index goes to red, green or blue, lowest bits highest."""
+    """VOC's colour of a class: every third bit of the index goes to red, green or blue, lowest bits
+    highest.
+    """
     channels = [0, 0, 0]
     for bit in range(8):
         channels[bit % 3] |= (index >> bit & 1) << (7 - bit // 3)
     return _packed(*channels)
 
 
-def _read_image(root: Path, stem: str, picture: Path, table: ClassTable, source: Source) -> SourceImage:
-    files = [root / folder / f"{stem}.png" for folder in ("SegmentationObject", "SegmentationClass")]
+def _read_image(
+    root: Path, stem: str, picture: Path, table: ClassTable, source: Source
+) -> SourceImage:
+    files = [
+        root / folder / f"{stem}.png" for folder in ("SegmentationObject", "SegmentationClass")
+    ]
     objects, void = _object_labels(files[0])
     classes = _class_labels(files[1], table)
     height, width = objects.shape
     if classes.shape != objects.shape:
-        raise DataError(f"{files[1]}: {classes.shape[1]}x{classes.shape[0]}, {files[0]} {width}x{height}")
+        raise DataError(
+            f"{files[1]}: {classes.shape[1]}x{classes.shape[0]}, {files[0]} {width}x{height}"
+        )
     image = open_image(picture, (width, height))
     found = []
     for value in np.unique(objects):
@@ -206,5 +227,7 @@ def _open(path: Path) -> Any:
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as an image") from error
     if picture.mode not in _MODES:
-        raise DataError(f"{path}: a PNG of mode {picture.mode}; a palette, 8-bit grey and RGB can be read")
+        raise DataError(
+            f"{path}: a PNG of mode {picture.mode}; a palette, 8-bit grey and RGB can be read"
+        )
     return picture

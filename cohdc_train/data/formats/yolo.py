@@ -1,4 +1,6 @@
-"""YOLO segmentation in Ultralytics' layout: data.yaml, images, and a text file of polygons each (no torch)."""
+"""YOLO segmentation in Ultralytics' layout: data.yaml, images, and a text file of polygons each (no
+torch).
+"""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -25,10 +27,11 @@ Row = dict[str, Any]
 
 
 def read_yolo(root: Path) -> Source:
-    """A data.yaml, or the folder with it: `names`, and `train` and `val`, each a folder, a list file, or several.
+    """A data.yaml, or the folder with it: `names`, and `train` and `val`, each a folder, a list
+    file, or several.
 
-    A row `class x y x y ...` is an object; one of five numbers is a box, which becomes a rectangle and is counted.
-    Images without a label file have no objects. Class ids keep their order.
+    A row `class x y x y ...` is an object; one of five numbers is a box, which becomes a rectangle
+    and is counted. Images without a label file have no objects. Class ids keep their order.
     Raises DataError in one line naming the file and the line.
     """
     path = _find_yaml(root)
@@ -48,7 +51,9 @@ def _find_yaml(root: Path) -> Path:
     found = [root / "data.yaml"] if (root / "data.yaml").is_file() else sorted(root.glob("*.y*ml"))
     if len(found) != 1:
         raise DataError(
-            f"{root}: {len(found)} YAML files where data.yaml should be" if found else f"{root}: no data.yaml"
+            f"{root}: {len(found)} YAML files where data.yaml should be"
+            if found
+            else f"{root}: no data.yaml"
         )
     return found[0]
 
@@ -83,15 +88,24 @@ def _images(path: Path, content: Row, split: str) -> Iterator[Path]:
     given = content.get(split)
     if not given:
         raise DataError(f"{path}: no {split!r}")
-    roots = [path.parent / str(content.get("path") or "."), path.parent]  # `path` may be another machine's
+    roots = [
+        path.parent / str(content.get("path") or "."),
+        path.parent,
+    ]  # `path` may be another machine's
     for entry in given if isinstance(given, list) else [given]:
         # exporters write ../train/images for what lies beside the file
         names = [str(entry), str(entry).removeprefix("../")]
-        place = next((root / name for root in roots for name in names if os.path.exists(root / name)), None)
+        place = next(
+            (root / name for root in roots for name in names if os.path.exists(root / name)), None
+        )
         if place is None:
             raise DataError(f"{path}: {split}: {entry} does not exist")
         if place.is_dir():
-            yield from (Path(os.path.abspath(p)) for p in place.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+            yield from (
+                Path(os.path.abspath(p))
+                for p in place.rglob("*")
+                if p.suffix.lower() in IMAGE_SUFFIXES
+            )
         else:
             yield from _listed(place, roots)
 
@@ -99,14 +113,18 @@ def _images(path: Path, content: Row, split: str) -> Iterator[Path]:
 def _listed(path: Path, roots: Sequence[Path]) -> Iterator[Path]:
     """The image files of a list file, relative to it or to the data set's root."""
     for number, line in read_lines(path):
-        found = next((root / line for root in (path.parent, *roots) if os.path.isfile(root / line)), None)
+        found = next(
+            (root / line for root in (path.parent, *roots) if os.path.isfile(root / line)), None
+        )
         if found is None:
             raise DataError(f"{path}:{number}: {line} does not exist")
         yield Path(os.path.abspath(found))
 
 
 def _label_file(image: Path) -> Path:
-    """The text file of an image: below `labels` where the image is below the last `images` of its path."""
+    """The text file of an image: below `labels` where the image is below the last `images` of its
+    path.
+    """
     parts = list(image.parts)
     for i in range(len(parts) - 2, -1, -1):
         if parts[i] == "images":
@@ -121,7 +139,9 @@ def _read_image(path: Path, source: Source) -> SourceImage:
     if not labels.exists():
         source.note("image without a label file: no objects", str(path))
         return image
-    return image.holding([_object(f"{labels}:{number}", line, image, source) for number, line in read_lines(labels)])
+    return image.holding(
+        [_object(f"{labels}:{number}", line, image, source) for number, line in read_lines(labels)]
+    )
 
 
 def _object(where: str, line: str, image: SourceImage, source: Source) -> SourceObject:
@@ -148,4 +168,6 @@ def _object(where: str, line: str, image: SourceImage, source: Source) -> Source
         cx, cy, width, height = values
         values = rectangle(cx - width / 2, cy - height / 2, cx + width / 2, cy + height / 2)
     sides = (image.width, image.height)
-    return SourceObject(names[label], [[round(value * sides[i % 2], 3) for i, value in enumerate(values)]], where)
+    return SourceObject(
+        names[label], [[round(value * sides[i % 2], 3) for i, value in enumerate(values)]], where
+    )

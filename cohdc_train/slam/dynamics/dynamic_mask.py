@@ -1,4 +1,6 @@
-"""A frame's mask as the tracker uses it: as given, without what has stood still, with what depth finds moving."""
+"""A frame's mask as the tracker uses it: as given, without what has stood still, with what depth
+finds moving.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +29,15 @@ class DynamicMaskEstimator:
         self._movers.forget()
 
     def of(
-        self, mask: Mask | None, depth: NDArray[np.float32], T_cw: Array, around: list[Keyframe], t: float
+        self,
+        mask: Mask | None,
+        depth: NDArray[np.float32],
+        T_cw: Array,
+        around: list[Keyframe],
+        t: float,
     ) -> Mask | None:
-        """mask, depth: [H, W], depth in m; T_cw: the frame's expected pose; around: keyframes that see the same place.
+        """mask, depth: [H, W], depth in m; T_cw: the frame's expected pose; around: keyframes that
+        see the same place.
 
         Returns [H, W] bool, True = dynamic; None where nothing was given and nothing moves.
         """
@@ -37,7 +45,9 @@ class DynamicMaskEstimator:
         judges, older = _spread(around), _spread([k for k in around if k.t <= t - _RESTED])
         all_of_them = list({k.index: k for k in (*judges, *older)}.values())
         row = {k.index: i for i, k in enumerate(all_of_them)}
-        comparison = self._geometry.compare(depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them])
+        comparison = self._geometry.compare(
+            depth, T_cw, [Reference(k.T_cw, k.nearest) for k in all_of_them]
+        )
 
         def against(keyframes: list[Keyframe]) -> DepthComparison:
             return comparison.only([row[k.index] for k in keyframes])

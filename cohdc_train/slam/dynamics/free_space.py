@@ -1,9 +1,11 @@
-"""Movers of any class, found by depth alone: what stands where a keyframe looked through is no part of the map.
+"""Movers of any class, found by depth alone: what stands where a keyframe looked through is no part
+of the map.
 
-The multi-view test of DynaSLAM, dense and coarse: every eighth pixel of the frame is placed in the world by the pose
-that is expected, and looked up in the depth of keyframes from other times. A point clearly nearer than what a keyframe
-saw behind it lies in space that was free then. A surface that stands still is never there, so two such votes are
-enough; depth that agrees, or that lies hidden behind something, says nothing.
+The multi-view test of DynaSLAM, dense and coarse: every eighth pixel of the frame is placed in the
+world by the pose that is expected, and looked up in the depth of keyframes from other times. A
+point clearly nearer than what a keyframe saw behind it lies in space that was free then. A surface
+that stands still is never there, so two such votes are enough; depth that agrees, or that lies
+hidden behind something, says nothing.
 """
 
 from dataclasses import dataclass
@@ -24,7 +26,10 @@ _NEAR = 0.2  # m: the sensor sees nothing nearer
 _FAR = 5.0  # m: nor anything reliable further off
 _VOTES = 2  # keyframes that must have looked through the place
 _GROWTH = 3  # coarse px a mover grows over its own surface
-_JUDGED, _MOVED = 0.6, 0.05  # of a part at rest: readings that agree, at least, and that do not, at most
+_JUDGED, _MOVED = (
+    0.6,
+    0.05,
+)  # of a part at rest: readings that agree, at least, and that do not, at most
 
 _Value = TypeVar("_Value", bound=np.generic)
 DepthGrid = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
@@ -33,7 +38,9 @@ _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 @dataclass(frozen=True)
 class Reference:
-    """What a keyframe saw. T_cw: [4, 4] world to camera, m; nearest: Coarse, the least depth around every pixel."""
+    """What a keyframe saw. T_cw: [4, 4] world to camera, m; nearest: Coarse, the least depth around
+    every pixel.
+    """
 
     T_cw: Array
     nearest: DepthGrid
@@ -43,8 +50,8 @@ class Reference:
 class DepthComparison:
     """A frame's depth held against k references.
 
-    image: Coarse, the frame's; through: [k, h, w] bool, the reference looked through the pixel's place; agrees:
-    [k, h, w] bool, it saw a surface there.
+    image: Coarse, the frame's; through: [k, h, w] bool, the reference looked through the pixel's
+    place; agrees: [k, h, w] bool, it saw a surface there.
     """
 
     image: DepthGrid
@@ -78,33 +85,49 @@ class FreeSpaceChecker:
         )
         self._measured = _maps((camera.distort(coarse) - _CENTRE) / _STEP, self._shape)
         whole = (camera.height, camera.width)
-        flat = cv2.convertMaps(*_maps(camera.undistort(_grid(*whole)), whole), cv2.CV_16SC2, nninterpolation=True)
+        flat = cv2.convertMaps(
+            *_maps(camera.undistort(_grid(*whole)), whole), cv2.CV_16SC2, nninterpolation=True
+        )
         self._flat = flat[0]  # where each pixel would be without distortion, whole px
 
     def nearest(self, depth: NDArray[np.float32]) -> DepthGrid:
-        """What a keyframe remembers of its depth image [H, W] m: the least around every coarse pixel."""
-        return np.asarray(cv2.erode(self._coarse(depth), np.ones((3, 3), np.uint8)), dtype=np.float32)
+        """What a keyframe remembers of its depth image [H, W] m: the least around every coarse
+        pixel.
+        """
+        return np.asarray(
+            cv2.erode(self._coarse(depth), np.ones((3, 3), np.uint8)), dtype=np.float32
+        )
 
-    def compare(self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]) -> DepthComparison:
+    def compare(
+        self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]
+    ) -> DepthComparison:
         """depth: [H, W] m, 0 = none; T_cw: [4, 4] the frame's expected pose."""
         image = self._coarse(depth)
         rows = np.flatnonzero(image)
         shape = (len(references), *self._shape)
         through, agrees = (np.zeros((shape[0], image.size), dtype=np.bool_) for _ in range(2))
         if references and len(rows):
-            seen, z = self._looked_up(self._rays[:, rows] * image.ravel()[rows], inverse(T_cw), references)
+            seen, z = self._looked_up(
+                self._rays[:, rows] * image.ravel()[rows], inverse(T_cw), references
+            )
             tolerance = _NEARER + _NEARER_PER_M * z
             through[:, rows] = (seen - z > tolerance) & (z > _NEAR)
             agrees[:, rows] = (seen > 0) & (np.abs(seen - z) <= tolerance) & (z > _NEAR)
         return DepthComparison(image, through.reshape(shape), agrees.reshape(shape))
 
     def movers(self, comparison: DepthComparison) -> NDArray[np.bool_]:
-        """Returns [h, w] bool, coarse: what two references looked through, and its surface around it."""
+        """Returns [h, w] bool, coarse: what two references looked through, and its surface around
+        it.
+        """
         image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
-        return _grown(votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image)
+        return _grown(
+            votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image
+        )
 
     def coarse(self, picture: NDArray[_Value]) -> NDArray[_Value]:
-        """picture: [H, W] as measured. Returns [h, w]: what it says in the middle of every coarse pixel."""
+        """picture: [H, W] as measured. Returns [h, w]: what it says in the middle of every coarse
+        pixel.
+        """
         return np.asarray(picture[self._row, self._column]).reshape(self._shape)
 
     def fine(self, movers: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -115,10 +138,14 @@ class FreeSpaceChecker:
         smooth = cv2.resize(movers.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(cv2.remap(smooth, self._flat, np.empty(0), cv2.INTER_NEAREST) > 127)
 
-    def static_components(self, mask: NDArray[np.bool_], comparison: DepthComparison) -> NDArray[np.bool_]:
-        """The connected parts of a mask [H, W] that lie where every reference that could see them saw a surface.
+    def static_components(
+        self, mask: NDArray[np.bool_], comparison: DepthComparison
+    ) -> NDArray[np.bool_]:
+        """The connected parts of a mask [H, W] that lie where every reference that could see them
+        saw a surface.
 
-        Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told from rest.
+        Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told
+        from rest.
         """
         count, parts = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
         coarse = self.coarse(parts)
@@ -134,27 +161,40 @@ class FreeSpaceChecker:
         """The least reading of every block, 0 where less than half of it has one."""
         h, w = self._shape
         depth = depth[: h * _STEP, : w * _STEP]
-        # Read as integers, floats from 0 up keep their order; one less, and 0, no reading, becomes the largest.
+        # Read as integers, floats from 0 up keep their order; one less, and 0, no reading, becomes
+        # the largest.
         bits = (depth.view(np.uint32) - np.uint32(1)).reshape(h, _STEP, w * _STEP).min(axis=1)
         bits = np.ascontiguousarray(bits.reshape(h, w, _STEP).transpose(2, 0, 1)).min(axis=0)
         least = (bits + np.uint32(1)).view(np.float32)
         known = (depth > 0).view(np.uint8) * np.uint8(128)
-        share = cv2.resize(known, (w, h), interpolation=cv2.INTER_AREA)  # mean: 64 is half of a block
+        share = cv2.resize(
+            known, (w, h), interpolation=cv2.INTER_AREA
+        )  # mean: 64 is half of a block
         image = np.where((share >= 64) & (least < _FAR), least, 0.0).astype(np.float32)
         return np.asarray(cv2.remap(image, *self._measured, cv2.INTER_NEAREST), dtype=np.float32)
 
     def _looked_up(
         self, points: NDArray[np.float32], T_wc: Array, references: list[Reference]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """points: [3, n] in the frame T_wc, m. Returns [k, n] m: the depth each reference has there, and that of the
-        points from it. float32: that is a hundredth of a coarse pixel, and half the time."""
+        """points: [3, n] in the frame T_wc, m. Returns [k, n] m: the depth each reference has
+        there, and that of the points from it. float32: that is a hundredth of a coarse pixel, and
+        half the time."""
         h, w = self._shape
         T = np.stack([reference.T_cw for reference in references]) @ T_wc
-        bent = np.concatenate([self._matrix @ T[:, :3, :3], self._matrix @ T[:, :3, 3:]], axis=2).astype(np.float32)
-        local = (bent[:, :, :3].reshape(-1, 3) @ points).reshape(len(references), 3, -1) + bent[:, :, 3:]
+        bent = np.concatenate(
+            [self._matrix @ T[:, :3, :3], self._matrix @ T[:, :3, 3:]], axis=2
+        ).astype(np.float32)
+        local = (bent[:, :, :3].reshape(-1, 3) @ points).reshape(len(references), 3, -1) + bent[
+            :, :, 3:
+        ]
         z = local[:, 2]
-        places = local[:, :2] / np.maximum(z, np.float32(_NEAR))[:, None] + np.float32(1.5)  # of the image with a rim
-        x, y = (np.clip(places[:, axis], 0, size + 1).astype(np.int32) for axis, size in ((0, w), (1, h)))
+        places = local[:, :2] / np.maximum(z, np.float32(_NEAR))[:, None] + np.float32(
+            1.5
+        )  # of the image with a rim
+        x, y = (
+            np.clip(places[:, axis], 0, size + 1).astype(np.int32)
+            for axis, size in ((0, w), (1, h))
+        )
         rimmed = np.zeros((len(references), h + 2, w + 2), dtype=np.float32)
         for image, reference in zip(rimmed, references, strict=True):
             image[1:-1, 1:-1] = reference.nearest
@@ -174,13 +214,19 @@ def _maps(places: Array, shape: tuple[int, int]) -> tuple[NDArray[np.float32], N
     return x.reshape(shape), y.reshape(shape)
 
 
-def _grown(found: NDArray[np.bool_], still: NDArray[np.bool_], image: DepthGrid) -> NDArray[np.bool_]:
-    """Specks dropped; the rest grown over its own surface, as far as that is not known to stand still."""
+def _grown(
+    found: NDArray[np.bool_], still: NDArray[np.bool_], image: DepthGrid
+) -> NDArray[np.bool_]:
+    """Specks dropped; the rest grown over its own surface, as far as that is not known to stand
+    still.
+    """
     _, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
     big = stats[:, cv2.CC_STAT_AREA] >= LEAST
     big[0] = False
     kept = big[labels]
     for _ in range(_GROWTH):
-        beside = cv2.dilate(np.where(kept, image, 0.0).astype(np.float32), _CROSS)  # depth of the mover next to it
+        beside = cv2.dilate(
+            np.where(kept, image, 0.0).astype(np.float32), _CROSS
+        )  # depth of the mover next to it
         kept |= (beside > 0) & (image > 0) & ~still & (np.abs(beside - image) < JUMP)
     return np.asarray(cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, _CROSS) > 0)

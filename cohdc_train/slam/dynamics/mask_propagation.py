@@ -1,11 +1,14 @@
-"""Masks carried from the frame they were made for to a later one: optical flow moves them, depth cuts their edge.
+"""Masks carried from the frame they were made for to a later one: optical flow moves them, depth
+cuts their edge.
 
-Everything here is at half the images' width and height, where flow costs a quarter. One step, from a frame to the next:
+Everything here is at half the images' width and height, where flow costs a quarter. One step, from
+a frame to the next:
 
-1. DIS optical flow says where every pixel of the new frame was in the old one; the mask is fetched from there.
+1. DIS optical flow says where every pixel of the new frame was in the old one; the mask is fetched
+   from there.
 2. Depth gate: a pixel stays in the mask if it is as deep as the pixel it came from, +-0.3 m.
-3. Cut by depth: within a narrow band about the edge, a pixel belongs to the mask if it is as deep as the mask nearby,
-   unless what lies around the mask is as deep as well: then flow alone says.
+3. Cut by depth: within a narrow band about the edge, a pixel belongs to the mask if it is as deep
+   as the mask nearby, unless what lies around the mask is as deep as well: then flow alone says.
 """
 
 from collections import deque
@@ -36,24 +39,30 @@ class Half:
 
 
 def halve(rgb: NDArray[np.uint8], depth: Floats) -> Half:
-    """rgb: [H, W, 3]; depth: [H, W] m, of which every second reading is taken: a mean would mix near and far."""
+    """rgb: [H, W, 3]; depth: [H, W] m, of which every second reading is taken: a mean would mix
+    near and far.
+    """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     thin = np.ascontiguousarray(depth[::2, ::2])
     size = (thin.shape[1], thin.shape[0])
-    return Half(np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), thin)
+    return Half(
+        np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), thin
+    )
 
 
 def halve_mask(mask: Mask) -> Mask:
     """[H, W] bool. Returns [h, w] bool of half size, True where half of the four pixels are."""
     size = ((mask.shape[1] + 1) // 2, (mask.shape[0] + 1) // 2)
-    return np.asarray(cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) > 127)
+    return np.asarray(
+        cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) > 127
+    )
 
 
 class Propagation:
     """The newest mask, kept at the newest frame.
 
-    `advance` takes every frame; `renew` takes a mask whenever one is ready, which may belong to an earlier frame: it is
-    carried through all frames since.
+    `advance` takes every frame; `renew` takes a mask whenever one is ready, which may belong to an
+    earlier frame: it is carried through all frames since.
     """
 
     def __init__(self) -> None:
@@ -102,15 +111,19 @@ class Propagation:
 
 
 def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
-    """One step. mask: [h, w] at the old frame; places: [h, w, 2] px in the old frame. Returns [h, w] at the new one.
+    """One step. mask: [h, w] at the old frame; places: [h, w, 2] px in the old frame. Returns [h,
+    w] at the new one.
 
-    A pixel that was outside the old frame takes the value at its border: whoever was cut there walks in.
+    A pixel that was outside the old frame takes the value at its border: whoever was cut there
+    walks in.
     """
     if not mask.any():
         return mask
     columns, rows = places[..., 0], places[..., 1]
     border = cv2.BORDER_REPLICATE
-    fetched = cv2.remap(mask.astype(np.uint8) * 255, columns, rows, cv2.INTER_LINEAR, borderMode=border)
+    fetched = cv2.remap(
+        mask.astype(np.uint8) * 255, columns, rows, cv2.INTER_LINEAR, borderMode=border
+    )
     came_from = cv2.remap(old.depth, columns, rows, cv2.INTER_NEAREST, borderMode=border)
     jumped = (new.depth > 0) & (came_from > 0) & (np.abs(new.depth - came_from) > _GATE)
     return cut_by_depth((fetched > 127) & ~jumped, new.depth)
@@ -119,8 +132,9 @@ def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
 def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
     """Give the band about a mask's edge to what it is as deep as.
 
-    mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, without the mask's inside nearby to compare
-    with, or where inside and outside are equally deep, as feet and the floor are, stay as they are. Returns [h, w].
+    mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, without the mask's inside
+    nearby to compare with, or where inside and outside are equally deep, as feet and the floor are,
+    stay as they are. Returns [h, w].
     """
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
     filled, has_depth = mask.astype(np.uint8), depth > 0
@@ -132,7 +146,9 @@ def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
 
 
 def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:
-    """Where some of a part of the image [h, w] is nearby, and where depth is its mean there, +-0.3 m."""
+    """Where some of a part of the image [h, w] is nearby, and where depth is its mean there, +-0.3
+    m.
+    """
     size = (_NEARBY, _NEARBY)
     weight = part.astype(np.float32)
     share, sums = cv2.boxFilter(weight, -1, size), cv2.boxFilter(weight * depth, -1, size)
@@ -149,7 +165,8 @@ class Job:
 
 
 class CarriedMasks:
-    """The newest mask there is, carried to every frame, and grown there by what its outline asked for.
+    """The newest mask there is, carried to every frame, and grown there by what its outline asked
+    for.
 
     newest: the frame that it was made of, None before the first.
     """
@@ -165,7 +182,9 @@ class CarriedMasks:
         return Job(self._propagation.advance(half), view, half)
 
     def renew(self, job: Job, mask: Mask, growth: float) -> None:
-        """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is to grow."""
+        """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is
+        to grow.
+        """
         self.newest, self._growth = job, growth
         self._propagation.renew(mask, job.number, job.half)
 

@@ -23,8 +23,8 @@ MaskSource = Callable[[View], Mask | None]
 def dynamic_mask(detections: "Detections", labels: frozenset[int], culling: Culling) -> Mask:
     """The union of the dynamic objects' masks, each grown by what `growth` says of its quality.
 
-    A contour that CQE doubts gets a wider band instead of being left out, for a missed person costs more than lost
-    corners.
+    A contour that CQE doubts gets a wider band instead of being left out, for a missed person costs
+    more than lost corners.
     Returns [H, W] bool, True = dynamic.
     """
     chosen = dynamic_objects(detections, labels, culling)
@@ -34,7 +34,9 @@ def dynamic_mask(detections: "Detections", labels: frozenset[int], culling: Cull
     return union
 
 
-def dynamic_objects(detections: "Detections", labels: frozenset[int], culling: Culling) -> "Detections":
+def dynamic_objects(
+    detections: "Detections", labels: frozenset[int], culling: Culling
+) -> "Detections":
     """Those of the dynamic classes that are sure enough."""
     sure = (detections.scores >= culling.score) & (detections.quality >= culling.quality)
     return detections.select(sure & np.isin(detections.labels, list(labels)))
@@ -60,7 +62,9 @@ class MaskFolder:
         self._folder, self._camera, self._culling = folder, camera, culling
 
     def __call__(self, view: View) -> Mask:
-        """[H, W] bool. Raises DataError when the frame's mask is missing: a missed person would spoil the map."""
+        """[H, W] bool. Raises DataError when the frame's mask is missing: a missed person would
+        spoil the map.
+        """
         return grow(*self.outline(view))
 
     def outline(self, view: View) -> tuple[Mask, float]:
@@ -69,24 +73,34 @@ class MaskFolder:
 
 
 class SegmenterMasks:
-    """Every frame goes through the segmenter; raises DataError for a class that the model does not know."""
+    """Every frame goes through the segmenter; raises DataError for a class that the model does not
+    know.
+    """
 
     def __init__(self, segmenter: "Segmenter", culling: Culling) -> None:
         names = segmenter.class_names
         wanted = names if culling.dynamic_classes is None else culling.dynamic_classes
         unknown = [name for name in wanted if name not in names]
         if unknown:
-            raise DataError(f"dynamic class {unknown[0]!r} is not one of the model's: {', '.join(names)}")
+            raise DataError(
+                f"dynamic class {unknown[0]!r} is not one of the model's: {', '.join(names)}"
+            )
         self._labels = frozenset(names.index(name) for name in wanted)
         self._segmenter = segmenter
-        self._culling = replace(culling, doubt=0.0) if culling.doubt is None and segmenter.cut_by_quality else culling
+        self._culling = (
+            replace(culling, doubt=0.0)
+            if culling.doubt is None and segmenter.cut_by_quality
+            else culling
+        )
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool."""
         return dynamic_mask(self._segmenter(view.rgb), self._labels, self._culling)
 
     def outline(self, view: View) -> tuple[Mask, float]:
-        """The mask before it grows, and by how many px it is to: as much as its contours should on average."""
+        """The mask before it grows, and by how many px it is to: as much as its contours should on
+        average.
+        """
         chosen = dynamic_objects(self._segmenter(view.rgb), self._labels, self._culling)
         quality = float(chosen.quality.mean()) if len(chosen) else 1.0
         return np.asarray(chosen.masks().any(axis=0)), growth(self._culling, quality)

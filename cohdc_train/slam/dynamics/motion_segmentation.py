@@ -1,12 +1,13 @@
 """Groups of points that do not move with the rest, found before they drag the pose along.
 
-A near thing that begins to move slowly takes the pose with it: its few points fix the camera's position better than a
-far wall's many, which a small turn reconciles, so that no single residual stands out. Every group is therefore judged
-by a pose that was found without it. What lies further from there than that pose's own uncertainty and the noise of
-measurement allow, moves. The poses of all groups come from sums of the same normal equations.
+A near thing that begins to move slowly takes the pose with it: its few points fix the camera's
+position better than a far wall's many, which a small turn reconciles, so that no single residual
+stands out. Every group is therefore judged by a pose that was found without it. What lies further
+from there than that pose's own uncertainty and the noise of measurement allow, moves. The poses of
+all groups come from sums of the same normal equations.
 
-Which of two groups that move against each other is the world, points that have long been known decide: a person near
-the camera may hold most of the points, but has only come into view.
+Which of two groups that move against each other is the world, points that have long been known
+decide: a person near the camera may hold most of the points, but has only come into view.
 """
 
 import numpy as np
@@ -44,9 +45,10 @@ def pose_of_rest(
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """The pose from the points that hold together, after those that move as groups were taken out.
 
-    T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more;
-    prior: where the camera was expected, which counts in poses, though not in how far a group may lie off.
-    Returns the pose, [m] bool inliers and [m] bool members of moving groups.
+    T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found
+    each, 1 and more;
+    prior: where the camera was expected, which counts in poses, though not in how far a group may
+    lie off. Returns the pose, [m] bool inliers and [m] bool members of moving groups.
     """
     moving = np.zeros(len(points), dtype=np.bool_)
     T_cw, inlier = optimize_pose(T_cw, points, seen, reprojection, prior=prior)
@@ -64,12 +66,16 @@ def pose_of_rest(
 
 
 def moving_group(
-    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel, found: NDArray[np.int64]
+    T_cw: Array,
+    points: Array,
+    seen: Observations,
+    reprojection: ReprojectionModel,
+    found: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
     """The group that most clearly moves against the rest.
 
-    T_cw: [4, 4] best pose of all; points: [m, 3] world, m; found: [m] frames that have found each, 1 and more. Returns
-    [m] bool, all False where everything holds together.
+    T_cw: [4, 4] best pose of all; points: [m, 3] world, m; found: [m] frames that have found each,
+    1 and more. Returns [m] bool, all False where everything holds together.
     """
     nothing = np.zeros(len(points), dtype=np.bool_)
     if len(points) < 3 * _LEAST:
@@ -103,8 +109,12 @@ def _may_move(groups: NDArray[np.bool_], J: Array, error: Array, steps: Array) -
     return np.asarray(2 * within <= groups.sum(axis=1))
 
 
-def _poses_without(groups: NDArray[np.bool_], J: Array, error: Array, limits: Array) -> tuple[Array, Array]:
-    """What each group's leaving would move the pose by, [g, 6], and the covariance of that pose, [g, 6, 6]."""
+def _poses_without(
+    groups: NDArray[np.bool_], J: Array, error: Array, limits: Array
+) -> tuple[Array, Array]:
+    """What each group's leaving would move the pose by, [g, 6], and the covariance of that pose,
+    [g, 6, 6].
+    """
     weight = huber_weights(np.einsum("mi,mi->m", error, error), limits)
     weighted = J * weight[:, None, None]
     H = (weighted.transpose(0, 2, 1) @ J).reshape(-1, 36)
@@ -115,7 +125,8 @@ def _poses_without(groups: NDArray[np.bool_], J: Array, error: Array, limits: Ar
 
 
 def nested_groups(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a judgeable size.
+    """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a
+    judgeable size.
 
     counts: [m] for how many each point counts when the world is sought.
     """
@@ -131,7 +142,9 @@ def nested_groups(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _patches(local: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Points by the nearest of a few that lie far apart: [p, m] bool, and the patches' middles [p, 3] m."""
+    """Points by the nearest of a few that lie far apart: [p, m] bool, and the patches' middles [p,
+    3] m.
+    """
     x, y, z = np.ascontiguousarray(local.T)
     middle = int(np.argmin(z))
     distance, nearest = np.full(len(local), np.inf), np.zeros(len(local), dtype=np.int64)

@@ -16,8 +16,12 @@ def hamming(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> NDArray[np
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """[30, 40] float32, blurred, zero mean and unit norm: the product of two is their normalised correlation."""
-    small = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (40, 30), interpolation=cv2.INTER_AREA)
+    """[30, 40] float32, blurred, zero mean and unit norm: the product of two is their normalised
+    correlation.
+    """
+    small = cv2.resize(
+        cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (40, 30), interpolation=cv2.INTER_AREA
+    )
     image = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5)
     image -= image.mean()
     return np.asarray(image / (np.linalg.norm(image) + 1e-6), dtype=np.float32)

@@ -22,16 +22,21 @@ class Keypoints:
 
     def take(self, rows: NDArray[np.int64]) -> "Keypoints":
         """The chosen rows."""
-        return Keypoints(self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.is_subpixel[rows])
+        return Keypoints(
+            self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.is_subpixel[rows]
+        )
 
 
 @dataclass(frozen=True)
 class Features:
     """n corners of one frame.
 
-    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n] int64 pyramid level;
-    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or it is not trusted;
-    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to (`refinement`).
+    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n]
+    int64 pyramid level;
+    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or
+    it is not trusted;
+    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to
+    (`refinement`).
     """
 
     pixels: NDArray[np.float64]
@@ -43,7 +48,14 @@ class Features:
 
     def __post_init__(self) -> None:
         n = len(self.pixels)
-        arrays = (self.pixels, self.points, self.octaves, self.descriptors, self.depths, self.is_subpixel)
+        arrays = (
+            self.pixels,
+            self.points,
+            self.octaves,
+            self.descriptors,
+            self.depths,
+            self.is_subpixel,
+        )
         shapes = tuple(array.shape for array in arrays)
         if shapes != ((n, 2), (n, 2), (n,), (n, 4), (n,), (n,)):
             raise ValueError(f"features disagree in shape: {shapes}")
@@ -57,7 +69,9 @@ class Features:
 
     @property
     def without_subpixel(self) -> "Features":
-        """The same corners as measurements of other points than those by whose patches they are precise."""
+        """The same corners as measurements of other points than those by whose patches they are
+        precise.
+        """
         return replace(self, is_subpixel=np.zeros_like(self.is_subpixel))
 
     @property
@@ -67,5 +81,7 @@ class Features:
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
-        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less where precise."""
+        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less
+        where precise.
+        """
         return np.where(self.is_subpixel, _PRECISE, 1.0) * self.scales

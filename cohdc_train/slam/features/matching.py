@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 from cohdc_train.slam.features.descriptors import bits_of, hamming
 from cohdc_train.slam.features.keypoints import LEVELS, Features
 
-_WIDEST = 2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
+_WIDEST = (
+    2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
+)
 
 
 @dataclass(frozen=True)
 class Matches:
-    """points: [m] int64 map point ids; corners: [m] int64 rows of the frame's features. Both without repetition."""
+    """points: [m] int64 map point ids; corners: [m] int64 rows of the frame's features. Both
+    without repetition.
+    """
 
     points: NDArray[np.int64]
     keypoints: NDArray[np.int64]
@@ -30,7 +34,8 @@ class Matches:
 class Projected:
     """Map points as a camera should see them.
 
-    ids: [m] int64; pixels: [m, 2] undistorted px; levels: [m] int64 pyramid level expected; descriptors: [m, 4] uint64.
+    ids: [m] int64; pixels: [m, 2] undistorted px; levels: [m] int64 pyramid level expected;
+    descriptors: [m, 4] uint64.
     """
 
     ids: NDArray[np.int64]
@@ -40,12 +45,16 @@ class Projected:
 
 
 def match_projected(
-    projected: Projected, features: Features, radius: float, max_distance: int = 90, ratio: float = 0.9
+    projected: Projected,
+    features: Features,
+    radius: float,
+    max_distance: int = 90,
+    ratio: float = 0.9,
 ) -> Matches:
     """Nearest descriptor among the corners near each point: within one level and `radius` px.
 
-    radius: px at level 0, growing with the corner's scale up to twofold; max_distance: bits; ratio: the best must beat
-    this share of the second best. One corner takes one point.
+    radius: px at level 0, growing with the corner's scale up to twofold; max_distance: bits; ratio:
+    the best must beat this share of the second best. One corner takes one point.
     """
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -60,14 +69,20 @@ def match_projected(
     return Matches(projected.ids[i], j)
 
 
-def _neighbors(projected: Projected, features: Features, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of a point and a corner, [k] rows of each: all within one level and `reach` px, and some further off.
+def _neighbors(
+    projected: Projected, features: Features, reach: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of a point and a corner, [k] rows of each: all within one level and `reach` px, and
+    some further off.
 
-    Corners are sorted by level and square cell of that size. The three cells side by side in which a point looks are
-    then one piece of the sorted list; there are nine such pieces, of three rows on three levels.
+    Corners are sorted by level and square cell of that size. The three cells side by side in which
+    a point looks are then one piece of the sorted list; there are nine such pieces, of three rows
+    on three levels.
     """
     keypoint = features.points.min(axis=0) - reach
-    cells = ((features.points - keypoint) / reach).astype(np.int64)  # from 1 on: a rim of empty cells lies around
+    cells = ((features.points - keypoint) / reach).astype(
+        np.int64
+    )  # from 1 on: a rim of empty cells lies around
     width, height = (cells.max(axis=0) + 2).tolist()
     key = ((features.octaves + 1) * height + cells[:, 1]) * width + cells[:, 0]
     order = np.argsort(key, kind="stable")
@@ -76,7 +91,9 @@ def _neighbors(projected: Projected, features: Features, reach: float) -> tuple[
     x, y = np.clip(places, 0, (width - 1, height - 1)).T
     beside = np.arange(-1, 2)[:, None]
     levels = projected.levels + 1 + beside[:, None]
-    rows = (levels * height + np.clip(y + beside, 0, height - 1)) * width  # a row at the rim comes twice, but is empty
+    rows = (
+        levels * height + np.clip(y + beside, 0, height - 1)
+    ) * width  # a row at the rim comes twice, but is empty
     low = begins[rows + np.maximum(x - 1, 0)].ravel()
     count = begins[rows + np.minimum(x + 2, width)].ravel() - low
     j = order[np.repeat(low - np.cumsum(count) + count, count) + np.arange(count.sum())]
@@ -86,8 +103,8 @@ def _neighbors(projected: Projected, features: Features, reach: float) -> tuple[
 def one_to_one(
     i: NDArray[np.int64], j: NDArray[np.int64], bits: NDArray[np.int64], ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Candidate pairs [k] with their distances, thinned: the best j of every i that passes the ratio, then of every j
-    the best i."""
+    """Candidate pairs [k] with their distances, thinned: the best j of every i that passes the
+    ratio, then of every j the best i."""
     order = _by(i, bits, j)
     i, j, bits = i[order], j[order], bits[order]
     first = np.r_[True, i[1:] != i[:-1]][: len(i)]
@@ -101,18 +118,29 @@ def one_to_one(
     return i[order][first], j[order][first]
 
 
-def _by(first: NDArray[np.int64], bits: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The order by first, then bits, 0..256, then last, of rows that all differ: one key sorts faster than three."""
+def _by(
+    first: NDArray[np.int64], bits: NDArray[np.int64], last: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The order by first, then bits, 0..256, then last, of rows that all differ: one key sorts
+    faster than three.
+    """
     return np.argsort((first * 257 + bits) * (int(last.max(initial=0)) + 1) + last)
 
 
 def match_descriptors(
-    ids: NDArray[np.int64], descriptors: NDArray[np.uint64], features: Features, max_distance: int = 60
+    ids: NDArray[np.int64],
+    descriptors: NDArray[np.uint64],
+    features: Features,
+    max_distance: int = 60,
 ) -> Matches:
-    """Mutually nearest descriptors without any idea of the pose. ids: [m]; descriptors: [m, 4] of the map points."""
+    """Mutually nearest descriptors without any idea of the pose. ids: [m]; descriptors: [m, 4] of
+    the map points.
+    """
     if len(ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    alike = _signs(descriptors) @ _signs(features.descriptors).T  # 256 bits less twice those that differ
+    alike = (
+        _signs(descriptors) @ _signs(features.descriptors).T
+    )  # 256 bits less twice those that differ
     nearest = alike.argmax(axis=1)
     rows = np.flatnonzero(alike.argmax(axis=0)[nearest] == np.arange(len(ids)))
     rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * max_distance]

@@ -1,4 +1,6 @@
-"""ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that can be trusted."""
+"""ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that
+can be trusted.
+"""
 
 from collections.abc import Sequence
 from operator import attrgetter
@@ -16,11 +18,18 @@ from cohdc_train.slam.geometry.se3 import inverse, to_local
 _CELL = 32  # px at the level of the corner
 _POOL = 2.0  # corners detected per corner kept: what the grid chooses from
 _ENOUGH = 1.6  # the same, below which the next threshold is tried
-_THRESHOLDS = (40, 20, 12, 7)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
+_THRESHOLDS = (
+    40,
+    20,
+    12,
+    7,
+)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
 
 
 class OrbExtractor:
-    """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a crowd costs none."""
+    """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a
+    crowd costs none.
+    """
 
     def __init__(self, camera: Camera, budget: int = MAX_KEYPOINTS) -> None:
         self.camera = camera
@@ -37,9 +46,11 @@ class OrbExtractor:
         mask: NDArray[np.bool_] | None = None,
         lag: NDArray[np.float64] | None = None,
     ) -> Features:
-        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no corner there.
+        """rgb: [H, W, 3] RGB; depth: [H, W] m, 0 = none; mask: [H, W] bool, True = dynamic: no
+        corner there.
 
-        lag: [4, 4] from the camera's frame at the colour image's time to that at depth's, where they differ.
+        lag: [4, 4] from the camera's frame at the colour image's time to that at depth's, where
+        they differ.
         """
         return self.measure(self.find(rgb, mask), depth, mask, lag)
 
@@ -53,8 +64,15 @@ class OrbExtractor:
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
-        pixels += 0.5 * (_SCALES[octaves] - 1.0)[:, None]  # ORB counts from the middle of a level's first pixel
-        return Keypoints(pixels, octaves, np.ascontiguousarray(words).view(np.uint64), np.zeros(len(pixels), np.bool_))
+        pixels += (
+            0.5 * (_SCALES[octaves] - 1.0)[:, None]
+        )  # ORB counts from the middle of a level's first pixel
+        return Keypoints(
+            pixels,
+            octaves,
+            np.ascontiguousarray(words).view(np.uint64),
+            np.zeros(len(pixels), np.bool_),
+        )
 
     def measure(
         self,
@@ -69,7 +87,9 @@ class OrbExtractor:
         depths = sample_depth(depth, pixels, mask)
         if lag is not None:
             depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
-        return Features(pixels, points, keypoints.octaves, keypoints.descriptors, depths, keypoints.is_subpixel)
+        return Features(
+            pixels, points, keypoints.octaves, keypoints.descriptors, depths, keypoints.is_subpixel
+        )
 
     def _caught_up(
         self,
@@ -78,7 +98,8 @@ class OrbExtractor:
         mask: NDArray[np.bool_] | None,
         lag: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Depths at the colour image's time: read where each corner was when depth was taken, and carried back.
+        """Depths at the colour image's time: read where each corner was when depth was taken, and
+        carried back.
 
         A hand moves a Kinect by half a centimetre in the 17 ms that its two images lie apart.
         """
@@ -91,10 +112,12 @@ class OrbExtractor:
     def _detect(
         self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None
     ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float64]]:
-        """Corners above the highest threshold that leaves enough, and the table of them that `spread` takes.
+        """Corners above the highest threshold that leaves enough, and the table of them that
+        `spread` takes.
 
-        Which threshold was tried first, the latest frame's, makes no difference to that: ORB's own order, which depends
-        on it and would decide between corners of one response, gives way to level, row and column.
+        Which threshold was tried first, the latest frame's, makes no difference to that: ORB's own
+        order, which depends on it and would decide between corners of one response, gives way to
+        level, row and column.
         """
         enough = _ENOUGH * self.budget
         for k in range(self._latest, len(_THRESHOLDS)):
@@ -134,9 +157,11 @@ def _orb(count: int, threshold: int) -> cv2.ORB:
 
 
 def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Choose corners evenly: per pyramid level, the best of every grid cell first, then every cell's second best.
+    """Choose corners evenly: per pyramid level, the best of every grid cell first, then every
+    cell's second best.
 
-    table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level. Returns rising rows.
+    table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level.
+    Returns rising rows.
     """
     best_first = np.argsort(-table[:, 3], kind="stable")
     octave = table[best_first, 2].astype(np.int64)

@@ -32,9 +32,11 @@ class Pyramid:
             levels.append(np.asarray(smaller, dtype=np.uint8))
         self.levels: list[Floats] = [level.astype(np.float32) for level in levels]
 
-    def cut(self, pixels: Array, octaves: NDArray[np.int64], side: int, shift: Array | float = 0.0) -> Floats:
-        """Grey values of the square around each of pixels [n, 2] px of level 0. side, and shift [n, 2]: px of each
-        one's own level.
+    def cut(
+        self, pixels: Array, octaves: NDArray[np.int64], side: int, shift: Array | float = 0.0
+    ) -> Floats:
+        """Grey values of the square around each of pixels [n, 2] px of level 0. side, and shift [n,
+        2]: px of each one's own level.
 
         Returns [n, side * side], row by row; beyond the border the border's.
         """
@@ -58,7 +60,9 @@ def square(side: int) -> Floats:
 
 
 def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
-    """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image, at their levels."""
+    """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image,
+    at their levels.
+    """
     result = np.empty((len(patches), side * side), dtype=np.float32)
     for start in range(0, len(patches), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
@@ -73,11 +77,12 @@ def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
 def align(
     pyramid: Pyramid, pixels: Array, octaves: NDArray[np.int64], template: Floats
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Minimise eq. 8 over each pixel by inverse composition; image and patch may differ in brightness and contrast.
+    """Minimise eq. 8 over each pixel by inverse composition; image and patch may differ in
+    brightness and contrast.
 
-    pixels: [n, 2] px; template: [n, side + 2, side + 2], the patch with one px around it for its gradient. Returns
-    [n, 2] shifts, px of each one's level, and [n] bool: False where the patch has no texture, leaves its surroundings,
-    or does not look alike.
+    pixels: [n, 2] px; template: [n, side + 2, side + 2], the patch with one px around it for its
+    gradient. Returns [n, 2] shifts, px of each one's level, and [n] bool: False where the patch has
+    no texture, leaves its surroundings, or does not look alike.
     """
     n = len(pixels)
     inner = _centered(template[:, 1:-1, 1:-1])

@@ -10,10 +10,11 @@ from cohdc_train.slam.geometry.se3 import Array
 
 
 def undo_rolling_shutter(features: Features, camera: Camera, twist: Array) -> Features:
-    """The corners as a camera would have measured them that takes all rows at once, halfway through the readout.
+    """The corners as a camera would have measured them that takes all rows at once, halfway through
+    the readout.
 
-    twist: [6] velocity of the world in the camera's frame, (m/s, rad/s), a point moves by v + omega x X. Corners
-    without depth move as if at the median depth of the others.
+    twist: [6] velocity of the world in the camera's frame, (m/s, rad/s), a point moves by v + omega
+    x X. Corners without depth move as if at the median depth of the others.
     """
     depths = features.depths
     if camera.readout == 0 or np.isnan(depths).all():
@@ -22,4 +23,8 @@ def undo_rolling_shutter(features: Features, camera: Camera, twist: Array) -> Fe
     known = np.where(np.isnan(depths), np.nanmedian(depths), depths)
     local = camera.backproject(features.points, known)
     local -= late[:, None] * (twist[:3] + np.cross(twist[3:], local))
-    return replace(features, points=camera.project(local), depths=np.where(np.isnan(depths), np.nan, local[:, 2]))
+    return replace(
+        features,
+        points=camera.project(local),
+        depths=np.where(np.isnan(depths), np.nan, local[:, 2]),
+    )

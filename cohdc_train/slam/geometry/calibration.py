@@ -16,18 +16,21 @@ _FREIBURG = re.compile(r"(?:freiburg|fr)([123])(?![0-9])", re.IGNORECASE)
 
 
 def load_camera(path: Path) -> Camera:
-    """Read `fx fy cx cy width height depth_scale` and, 0 where absent, `k1 k2 p1 p2 k3`, `baseline`, `readout`.
+    """Read `fx fy cx cy width height depth_scale` and, 0 where absent, `k1 k2 p1 p2 k3`,
+    `baseline`, `readout`.
 
     A camera with a baseline needs no depth_scale.
 
-    Raises DataError naming the file, and the line where there is one, for yaml that cannot be parsed, a missing or
-    unknown key, or a value that is not a usable number.
+    Raises DataError naming the file, and the line where there is one, for yaml that cannot be
+    parsed, a missing or unknown key, or a value that is not a usable number.
     """
     values: dict[str, float] = {}
     known = {field.name for field in fields(Camera)}
     for key, value, line in _numbers(path):
         if key not in known:
-            raise DataError(f"{path}:{line}: unknown key {key!r}; a camera has {' '.join(sorted(known))}")
+            raise DataError(
+                f"{path}:{line}: unknown key {key!r}; a camera has {' '.join(sorted(known))}"
+            )
         if key in _REQUIRED and key not in ("cx", "cy") and value <= 0:
             raise DataError(f"{path}:{line}: {key} must be above 0, not {value:g}")
         if key in ("baseline", "readout") and value < 0:
@@ -45,8 +48,8 @@ def load_camera(path: Path) -> Camera:
 def choose_camera(sequence: Path, given: Path | None) -> tuple[Camera, str]:
     """The camera of a sequence, and a phrase that says where it came from.
 
-    Order: `given`, `camera.yaml` in the sequence's folder, the freiburg1/2/3 preset that the folder's name calls for.
-    Raises DataError when none of the three applies.
+    Order: `given`, `camera.yaml` in the sequence's folder, the freiburg1/2/3 preset that the
+    folder's name calls for. Raises DataError when none of the three applies.
     """
     if given is not None:
         path = config_path(given)
@@ -60,7 +63,9 @@ def choose_camera(sequence: Path, given: Path | None) -> tuple[Camera, str]:
         message = f"{sequence}: cannot tell the camera from the folder's name; put camera.yaml there or give --camera"
         raise DataError(message)
     preset = f"slam/freiburg{match.group(1)}.yaml"
-    return load_camera(config_path(preset)), f"preset {preset}, guessed from the folder's name {name}"
+    return load_camera(
+        config_path(preset)
+    ), f"preset {preset}, guessed from the folder's name {name}"
 
 
 def _numbers(path: Path) -> list[tuple[str, float, int]]:

@@ -1,4 +1,6 @@
-"""The pinhole camera with Brown-Conrady distortion: its yaml file, and the choice of one for a sequence."""
+"""The pinhole camera with Brown-Conrady distortion: its yaml file, and the choice of one for a
+sequence.
+"""
 
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -10,10 +12,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in px; a stored depth value divided by `depth_scale` is metres along the optical axis.
+    """Intrinsics in px; a stored depth value divided by `depth_scale` is metres along the optical
+    axis.
 
-    baseline: m from the left camera of a rectified stereo pair to the right one; 0 for a camera that measures depth.
-    readout: s from the colour image's first row to its last; 0 for a camera that takes all rows at once.
+    baseline: m from the left camera of a rectified stereo pair to the right one; 0 for a camera
+    that measures depth.
+    readout: s from the colour image's first row to its last; 0 for a camera that takes all rows at
+    once.
     """
 
     fx: float
@@ -33,7 +38,9 @@ class Camera:
 
     @property
     def far(self) -> float:
-        """m: depth beyond errs too much to begin with: by 4 cm and more, a Kinect's; 40 baselines, a stereo pair's."""
+        """m: depth beyond errs too much to begin with: by 4 cm and more, a Kinect's; 40 baselines,
+        a stereo pair's.
+        """
         return 40 * self.baseline if self.baseline else 5.0
 
     @property
@@ -46,7 +53,9 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """pixels: [n, 2] as measured, px. Returns [n, 2] px where a lens without distortion would put them."""
+        """pixels: [n, 2] as measured, px. Returns [n, 2] px where a lens without distortion would
+        put them.
+        """
         if not self.distortion.any() or len(pixels) == 0:
             return np.asarray(pixels, dtype=np.float64).copy()
         # The default stops at an error of 0.01 px and more in the corners of freiburg1.
@@ -56,7 +65,9 @@ class Camera:
         return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
 
     def distort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """pixels: [n, 2] without distortion, px. Returns [n, 2] px where the lens puts them: undistort's inverse."""
+        """pixels: [n, 2] without distortion, px. Returns [n, 2] px where the lens puts them:
+        undistort's inverse.
+        """
         if not self.distortion.any() or len(pixels) == 0:
             return np.asarray(pixels, dtype=np.float64).copy()
         rays = self.backproject(pixels, np.ones(len(pixels))).reshape(-1, 1, 3)
@@ -68,7 +79,9 @@ class Camera:
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
-    def backproject(self, pixels: NDArray[np.float64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    def backproject(
+        self, pixels: NDArray[np.float64], depth: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """pixels: [n, 2] undistorted px; depth: [n] m. Returns [n, 3] in the camera frame, m."""
         x = (pixels[:, 0] - self.cx) / self.fx * depth
         y = (pixels[:, 1] - self.cy) / self.fy * depth
@@ -81,7 +94,9 @@ class Camera:
 
 @cache
 def maps_onto(camera: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What cv2.remap needs to make a camera's image one that a pinhole camera in its place would take."""
+    """What cv2.remap needs to make a camera's image one that a pinhole camera in its place would
+    take.
+    """
     size = (pinhole.width, pinhole.height)
     matrices = camera.matrix(), camera.distortion, None, pinhole.matrix()
     x, y = cv2.initUndistortRectifyMap(*matrices, size, cv2.CV_32FC1)

@@ -13,7 +13,8 @@ from cohdc_train.slam.geometry.camera import Camera, maps_onto
 class DepthImage:
     """What a keyframe keeps to be aligned.
 
-    gray: [h, w] float32; depth: [h, w] float32 m, 0 = none or dynamic; camera: the picture's own, without distortion.
+    gray: [h, w] float32; depth: [h, w] float32 m, 0 = none or dynamic; camera: the picture's own,
+    without distortion.
     """
 
     gray: NDArray[np.float32]
@@ -30,9 +31,14 @@ class DepthImage:
 
 
 def make_depth_image(
-    rgb: NDArray[np.uint8], depth: NDArray[np.float32], mask: NDArray[np.bool_] | None, camera: Camera
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    mask: NDArray[np.bool_] | None,
+    camera: Camera,
 ) -> DepthImage:
-    """A small picture without distortion. rgb: [H, W, 3]; depth: [H, W] m, 0 = none; mask: [H, W], True = dynamic."""
+    """A small picture without distortion. rgb: [H, W, 3]; depth: [H, W] m, 0 = none; mask: [H, W],
+    True = dynamic.
+    """
     scale = _SIDE / max(camera.width, camera.height)
     width, height = round(camera.width * scale), round(camera.height * scale)
     cx, cy = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
@@ -40,7 +46,11 @@ def make_depth_image(
     maps = maps_onto(camera, small)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     gray = cv2.GaussianBlur(gray, (0, 0), 0.5 / scale) if scale < 1 else gray
-    still = depth if mask is None else np.where(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0, 0, depth)
+    still = (
+        depth
+        if mask is None
+        else np.where(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0, 0, depth)
+    )
     readings = cv2.remap(still.astype(np.float32), *maps, cv2.INTER_NEAREST)
     return DepthImage(_float32(cv2.remap(gray, *maps, cv2.INTER_LINEAR)), _float32(readings), small)
 

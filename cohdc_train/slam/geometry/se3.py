@@ -25,8 +25,12 @@ def exp_se3(xi: Array) -> Array:
 
 
 def log_se3(T: Array) -> Array:
-    """T: [..., 4, 4]. Returns [..., 6] (translation part, rotation vector rad), the inverse of exp_se3."""
-    phi = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
+    """T: [..., 4, 4]. Returns [..., 6] (translation part, rotation vector rad), the inverse of
+    exp_se3.
+    """
+    phi = (
+        Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
+    )
     cross = skew(phi)
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     half = np.maximum(angle / 2, 1e-9)

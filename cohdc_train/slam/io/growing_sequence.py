@@ -19,9 +19,10 @@ _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 class Followed(LiveSource):
     """A sequence's folder while its lists grow.
 
-    Ends with a file `done` in it or after `idle` s without a new line, when every listed pair has been given; at once
-    when stopped. Pairs are chosen in the order of time, nearest first. A line or image that cannot be used is told on
-    stderr and left out, but for the first, whose DataError is raised, as it is when no frame comes.
+    Ends with a file `done` in it or after `idle` s without a new line, when every listed pair has
+    been given; at once when stopped. Pairs are chosen in the order of time, nearest first. A line
+    or image that cannot be used is told on stderr and left out, but for the first, whose DataError
+    is raised, as it is when no frame comes.
     """
 
     def __init__(self, folder: Path, camera: Camera, layout: Layout, idle: float) -> None:
@@ -48,14 +49,22 @@ class Followed(LiveSource):
             given += 1
             yield view
         if given == 0 and not self._stopped.is_set():
-            raise DataError(f"{self._folder}: no frame came in {self._idle:g} s; nothing is written")
+            raise DataError(
+                f"{self._folder}: no frame came in {self._idle:g} s; nothing is written"
+            )
 
     def _pairs(self) -> Iterator[tuple[Entry, Entry]]:
-        """Pairs as soon as their partner is certain: when the second list has come as far as the entry."""
+        """Pairs as soon as their partner is certain: when the second list has come as far as the
+        entry.
+        """
         waiting: tuple[list[Entry], list[Entry]] = [], []
         heard = time.monotonic()
         while True:
-            ended = self._done.exists() or self._stopped.is_set() or time.monotonic() - heard > self._idle
+            ended = (
+                self._done.exists()
+                or self._stopped.is_set()
+                or time.monotonic() - heard > self._idle
+            )
             for queue, growing in zip(waiting, self._lists, strict=True):
                 if news := growing.news(ended):
                     heard = time.monotonic()
@@ -81,7 +90,9 @@ class Followed(LiveSource):
         for image in images:
             while not _is_whole(image):
                 if self._stopped.is_set() or time.monotonic() - start > _PATIENCE:
-                    raise DataError(f"{image}: not there, or not whole, {_PATIENCE:g} s after it was listed")
+                    raise DataError(
+                        f"{image}: not there, or not whole, {_PATIENCE:g} s after it was listed"
+                    )
                 time.sleep(_POLL)
 
 

@@ -19,7 +19,9 @@ Frame = tuple[NDArray[np.uint8], NDArray[np.float32], float]
 
 
 class LiveSource:
-    """What both have in common: nobody knows how many views will come, and `stop` ends them after the current one."""
+    """What both have in common: nobody knows how many views will come, and `stop` ends them after
+    the current one.
+    """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -39,11 +41,12 @@ class LiveSource:
 
 
 class Live(LiveSource):
-    """A camera of one's own: anything that gives (rgb, depth_m, t) one after the other, or None while nothing comes.
+    """A camera of one's own: anything that gives (rgb, depth_m, t) one after the other, or None
+    while nothing comes.
 
-    rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, registered to the colour image, 0 or nan = no
-    reading; t: s, rising. Both images are copied: a camera may use its buffers again. Raises DataError for a frame of
-    another shape or a time that does not rise.
+    rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, registered to the colour
+    image, 0 or nan = no reading; t: s, rising. Both images are copied: a camera may use its buffers
+    again. Raises DataError for a frame of another shape or a time that does not rise.
     """
 
     def __init__(self, camera: Camera, frames: Iterable[Frame | None]) -> None:
@@ -61,20 +64,32 @@ class Live(LiveSource):
             size = (self.camera.height, self.camera.width)
             if rgb.shape != (*size, 3) or rgb.dtype != np.uint8 or depth_m.shape != size:
                 found = f"colour {rgb.shape} {rgb.dtype} and depth {depth_m.shape}"
-                raise DataError(f"live frame at {t:.6f} s: {found}; the camera is {size[1]}x{size[0]}")
+                raise DataError(
+                    f"live frame at {t:.6f} s: {found}; the camera is {size[1]}x{size[0]}"
+                )
             if not t > last:
                 raise DataError(f"live frame at {t:.6f} s does not come after {last:.6f} s")
             last, stamp = t, f"{t:.6f}"
-            yield View(t, stamp, stamp, rgb.copy(), np.nan_to_num(depth_m, nan=0.0, posinf=0.0).astype(np.float32))
+            yield View(
+                t,
+                stamp,
+                stamp,
+                rgb.copy(),
+                np.nan_to_num(depth_m, nan=0.0, posinf=0.0).astype(np.float32),
+            )
 
 
 @contextmanager
 def stopped_by_ctrl_c(source: object) -> Iterator[None]:
-    """While it is open, the first Ctrl-C stops a live source, whose results are written; the second interrupts as ever.
+    """While it is open, the first Ctrl-C stops a live source, whose results are written; the second
+    interrupts as ever.
 
     Does nothing for other sources and outside the main thread.
     """
-    if not isinstance(source, LiveSource) or threading.current_thread() is not threading.main_thread():
+    if (
+        not isinstance(source, LiveSource)
+        or threading.current_thread() is not threading.main_thread()
+    ):
         yield
         return
 

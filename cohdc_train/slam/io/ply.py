@@ -23,7 +23,9 @@ end_header
 
 
 def write_ply(path: Path, points: NDArray[np.floating], colors: NDArray[np.uint8]) -> None:
-    """Write points ([n, 3], m) with colours ([n, 3] uint8 RGB) as binary little-endian PLY, whole or not at all."""
+    """Write points ([n, 3], m) with colours ([n, 3] uint8 RGB) as binary little-endian PLY, whole
+    or not at all.
+    """
     rows = np.empty(len(points), dtype=_VERTEX)
     rows["position"], rows["colour"] = points, colors
     write_bytes(path, _HEADER.format(count=len(points)).encode("ascii") + rows.tobytes())

@@ -28,10 +28,10 @@ def measure(
 ) -> dict[str, Any]:
     """The numbers of metrics.json but the seed.
 
-    dropped: frames that came while the tracker was busy and have no record; they count as frames without a pose.
-    `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map` over keyframes only, `depth` of
-    stereo pairs only; `fps` is frames over the time of all stages. Errors are absent without a truth, and, which is
-    told on stderr, where it is of another time.
+    dropped: frames that came while the tracker was busy and have no record; they count as frames
+    without a pose. `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map`
+    over keyframes only, `depth` of stereo pairs only; `fps` is frames over the time of all stages.
+    Errors are absent without a truth, and, which is told on stderr, where it is of another time.
     """
     poses = [record.pose for record in records]
     depth = [record.depth_ms for record in records]
@@ -65,7 +65,11 @@ def quantiles(values: list[float]) -> dict[str, float]:
 
 
 def write_run(
-    folder: Path, records: list[FrameRecord], trajectory: Trajectory, metrics: dict[str, Any], config: dict[str, Any]
+    folder: Path,
+    records: list[FrameRecord],
+    trajectory: Trajectory,
+    metrics: dict[str, Any],
+    config: dict[str, Any],
 ) -> None:
     """Write trajectory.txt, metrics.json, frames.csv and config.yaml into an existing folder."""
     write_tum(folder / "trajectory.txt", trajectory)
@@ -73,12 +77,25 @@ def write_run(
     (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     with (folder / "frames.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["stamp", "tracked", "keyframe", "inliers", "culled_share", "segment_ms", "track_ms", "map_ms"])
+        writer.writerow(
+            [
+                "stamp",
+                "tracked",
+                "keyframe",
+                "inliers",
+                "culled_share",
+                "segment_ms",
+                "track_ms",
+                "map_ms",
+            ]
+        )
         for record in records:
             pose = record.pose
             times = [f"{ms:.2f}" for ms in (record.segment_ms, pose.track_ms, pose.map_ms)]
             culled = f"{record.culled:.4f}"
-            writer.writerow([record.stamp, int(pose.tracked), int(pose.keyframe), pose.inliers, culled, *times])
+            writer.writerow(
+                [record.stamp, int(pose.tracked), int(pose.keyframe), pose.inliers, culled, *times]
+            )
 
 
 def publish_run(part: Path, out: Path) -> None:

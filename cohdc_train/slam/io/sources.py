@@ -1,4 +1,6 @@
-"""Where frames come from: anything that gives one view after the other; here a recorded TUM sequence."""
+"""Where frames come from: anything that gives one view after the other; here a recorded TUM
+sequence.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,7 +15,8 @@ from cohdc_train.slam.io.tum import Entry, read_depth, read_pairs, read_rgb
 class Source(Protocol):
     """Views in the order of time, each made when it is asked for.
 
-    groundtruth: file in TUM's format, or None; without_depth: colour images left out for want of a depth image.
+    groundtruth: file in TUM's format, or None; without_depth: colour images left out for want of a
+    depth image.
     """
 
     camera: Camera
@@ -33,8 +36,8 @@ class Source(Protocol):
 class Layout:
     """How a folder holds frames: two lists in the manner of TUM's rgb.txt, paired by their stamps.
 
-    max_difference: s between the two of a pair; view: makes a view of them, or raises DataError for an image that
-    cannot be used.
+    max_difference: s between the two of a pair; view: makes a view of them, or raises DataError for
+    an image that cannot be used.
     """
 
     first: str
@@ -56,7 +59,8 @@ def rgbd_layout(camera: Camera) -> Layout:
 class Recorded:
     """A recorded sequence, in TUM's layout when no other is given.
 
-    Raises DataError as read_pairs does, and, while views are taken, for images that are broken or of another size.
+    Raises DataError as read_pairs does, and, while views are taken, for images that are broken or
+    of another size.
     """
 
     def __init__(self, folder: Path, camera: Camera, layout: Layout | None = None) -> None:

@@ -1,4 +1,6 @@
-"""A sequence folder in the layout of the TUM RGB-D benchmark: rgb.txt and depth.txt, paired by nearest time stamp."""
+"""A sequence folder in the layout of the TUM RGB-D benchmark: rgb.txt and depth.txt, paired by
+nearest time stamp.
+"""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +18,9 @@ from cohdc_train.trajectory.association import associate
 
 @dataclass(frozen=True)
 class Frame:
-    """One associated pair; `t` and `stamp` are the colour image's, s; `depth_stamp` is the depth image's own."""
+    """One associated pair; `t` and `stamp` are the colour image's, s; `depth_stamp` is the depth
+    image's own.
+    """
 
     t: float
     stamp: str
@@ -27,7 +31,9 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sequence:
-    """frames in the order of time; `without_depth`: how many colour images found no depth image near enough."""
+    """frames in the order of time; `without_depth`: how many colour images found no depth image
+    near enough.
+    """
 
     folder: Path
     frames: tuple[Frame, ...]
@@ -50,45 +56,62 @@ class Entry:
 
 
 def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
-    """Read the two lists and pair them one to one, nearest stamps first, as TUM's associate tool does.
+    """Read the two lists and pair them one to one, nearest stamps first, as TUM's associate tool
+    does.
 
-    max_difference: s. Raises DataError naming file and line for a missing or broken list, stamps that do not rise, an
-    image that is not there, or when nothing pairs.
+    max_difference: s. Raises DataError naming file and line for a missing or broken list, stamps
+    that do not rise, an image that is not there, or when nothing pairs.
     """
     pairs, alone = read_pairs(folder / "rgb.txt", folder / "depth.txt", max_difference)
-    frames = tuple(Frame(rgb.t, rgb.stamp, depth.stamp, rgb.image, depth.image) for rgb, depth in pairs)
+    frames = tuple(
+        Frame(rgb.t, rgb.stamp, depth.stamp, rgb.image, depth.image) for rgb, depth in pairs
+    )
     return Sequence(folder, frames, alone)
 
 
-def read_pairs(first: Path, second: Path, max_difference: float) -> tuple[list[tuple[Entry, Entry]], int]:
-    """Two lists paired as read_sequence does, and how many of the first stay alone. Raises DataError as it does."""
+def read_pairs(
+    first: Path, second: Path, max_difference: float
+) -> tuple[list[tuple[Entry, Entry]], int]:
+    """Two lists paired as read_sequence does, and how many of the first stay alone. Raises
+    DataError as it does.
+    """
     ours, theirs = _read_list(first), _read_list(second)
     times = np.array([entry.t for entry in ours]), np.array([entry.t for entry in theirs])
     pairs = [(ours[i], theirs[j]) for i, j in associate(*times, max_difference).tolist()]
     if not pairs:
-        message = f"no image of {first.name} lies within {max_difference:g} s of one of {second.name}"
+        message = (
+            f"no image of {first.name} lies within {max_difference:g} s of one of {second.name}"
+        )
         raise DataError(f"{first.parent}: {message}")
     return pairs, len(ours) - len(pairs)
 
 
 def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """[height, width, 3] uint8 RGB. Raises DataError when the file is missing, broken or of another size."""
+    """[height, width, 3] uint8 RGB. Raises DataError when the file is missing, broken or of another
+    size.
+    """
     image = _decode(path, cv2.IMREAD_COLOR)
     _check_size(path, image.shape[:2], camera)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
-    """[height, width] m, 0 = no reading. Raises DataError unless it is a 16 bit image of the camera's size."""
+    """[height, width] m, 0 = no reading. Raises DataError unless it is a 16 bit image of the
+    camera's size.
+    """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
-        raise DataError(f"{path}: depth must be one channel of 16 bit, not {image.dtype} of shape {image.shape}")
+        raise DataError(
+            f"{path}: depth must be one channel of 16 bit, not {image.dtype} of shape {image.shape}"
+        )
     _check_size(path, image.shape, camera)
     return image.astype(np.float32) / np.float32(camera.depth_scale)
 
 
 def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
-    """[height, width] bool, True = dynamic (any value above 0 in the file). Raises DataError as read_rgb does."""
+    """[height, width] bool, True = dynamic (any value above 0 in the file). Raises DataError as
+    read_rgb does.
+    """
     image = _decode(path, cv2.IMREAD_GRAYSCALE)
     _check_size(path, image.shape, camera)
     return np.asarray(image > 0)
@@ -123,7 +146,9 @@ def _read_list(path: Path) -> list[Entry]:
         if entry is None:
             continue
         if entries and entry.t <= entries[-1].t:
-            raise DataError(f"{path}:{number}: time stamp {entry.stamp} does not come after {entries[-1].stamp}")
+            raise DataError(
+                f"{path}:{number}: time stamp {entry.stamp} does not come after {entries[-1].stamp}"
+            )
         if not entry.image.is_file():
             raise DataError(f"{path}:{number}: {line.split()[1]} does not exist in {path.parent}")
         entries.append(entry)
@@ -133,7 +158,9 @@ def _read_list(path: Path) -> list[Entry]:
 
 
 def read_entry(path: Path, number: int, line: str) -> Entry | None:
-    """A line of the list `path`; None for a comment and a blank one. Raises DataError naming file and line."""
+    """A line of the list `path`; None for a comment and a blank one. Raises DataError naming file
+    and line.
+    """
     words = line.split()
     if not words or words[0].startswith("#"):
         return None

@@ -1,4 +1,6 @@
-"""Loop closing (paper section 2.3): a place seen before is recognised and checked, the drift since is spread out."""
+"""Loop closing (paper section 2.3): a place seen before is recognised and checked, the drift since
+is spread out.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +41,8 @@ class LoopCloser:
         self._verify = LoopVerifier(world, reprojection, np.random.default_rng(seed))
 
     def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
-        """Look for a loop with the newest keyframe of the map; every one must be given once, when it has joined.
+        """Look for a loop with the newest keyframe of the map; every one must be given once, when
+        it has joined.
 
         Where one is found, all poses and points of the map move; returns whether that happened.
         """
@@ -112,7 +115,9 @@ class LoopCloser:
         )
 
     def _join(self, loop: Loop) -> None:
-        """Make the points one that both ends of the loop have, and adjust around the newest keyframe."""
+        """Make the points one that both ends of the loop have, and adjust around the newest
+        keyframe.
+        """
         world = self._world
         keyframe = world.keyframes[-1]
         place = world.covisible(world.anchor(loop.old)[0].seen_points(), _FUSE)
@@ -130,11 +135,14 @@ def _shared_points(world: Map) -> NDArray[np.int64]:
     return np.asarray((incidence @ incidence.T).toarray(), dtype=np.int64)
 
 
-def _graph_pairs(shared: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of keyframes that the graph holds together, older first, and how many points they share.
+def _graph_pairs(
+    shared: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of keyframes that the graph holds together, older first, and how many points they
+    share.
 
-    Every keyframe holds to the one before it and to its strongest neighbours of long ago. Those in between would repeat
-    what the chain says already and stiffen it against the loop.
+    Every keyframe holds to the one before it and to its strongest neighbours of long ago. Those in
+    between would repeat what the chain says already and stiffen it against the loop.
     """
     pairs = []
     for new in range(1, len(shared)):

@@ -1,4 +1,6 @@
-"""Recognising a place without a vocabulary: binary descriptors vote for the keyframes that hold nearly the same."""
+"""Recognising a place without a vocabulary: binary descriptors vote for the keyframes that hold
+nearly the same.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,8 @@ _BITS = 16  # of 256, drawn per table: two descriptors meet in a table when all 
 class PlaceRecognition:
     """An index over keyframes by locality-sensitive hashing.
 
-    Each table hashes a descriptor by its own random bits. A hash that few keyframes hold says much, one that many hold
-    says little: votes are weighed by inverse document frequency.
+    Each table hashes a descriptor by its own random bits. A hash that few keyframes hold says much,
+    one that many hold says little: votes are weighed by inverse document frequency.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -33,8 +35,8 @@ class PlaceRecognition:
         self._holders[self._hashes.pop(index)] -= 1
 
     def likeness(self, descriptors: NDArray[np.uint64]) -> NDArray[np.float64]:
-        """descriptors: [n, 4]. Returns [keyframes] 0..1, the weighed share of the hashes that each one has too, in the
-        order they were added."""
+        """descriptors: [n, 4]. Returns [keyframes] 0..1, the weighed share of the hashes that each
+        one has too, in the order they were added."""
         hashes = self._hash(descriptors)
         weight = np.zeros(_TABLES << _BITS, dtype=np.float32)
         weight[hashes] = np.log((len(self._hashes) + 1) / np.maximum(self._holders[hashes], 1))

@@ -1,4 +1,6 @@
-"""Is this the place seen before? Asked of the geometry of points, of neighbours and of the pictures themselves."""
+"""Is this the place seen before? Asked of the geometry of points, of neighbours and of the pictures
+themselves.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,7 +37,8 @@ _REFINED_RAD = 0.02
 
 @dataclass(frozen=True)
 class Loop:
-    """A checked loop: for every entry, T carries from the camera of keyframe `old` to the camera of keyframe `new`.
+    """A checked loop: for every entry, T carries from the camera of keyframe `old` to the camera of
+    keyframe `new`.
 
     old: index; new: [l] indices, first the keyframe that found the loop; T: [l, 4, 4], m.
     """
@@ -48,10 +51,14 @@ class Loop:
 class LoopVerifier:
     """Checks candidates; all its randomness comes from `rng`."""
 
-    def __init__(self, world: Map, reprojection: ReprojectionModel, rng: np.random.Generator) -> None:
+    def __init__(
+        self, world: Map, reprojection: ReprojectionModel, rng: np.random.Generator
+    ) -> None:
         self._world, self._reprojection, self._rng = world, reprojection, rng
 
-    def __call__(self, keyframe: Keyframe, old: Keyframe, pictures: Mapping[int, DepthImage]) -> Loop | None:
+    def __call__(
+        self, keyframe: Keyframe, old: Keyframe, pictures: Mapping[int, DepthImage]
+    ) -> Loop | None:
         """The loop between a keyframe and an old one, or None. pictures: of both, by index."""
         ids = old.seen_points()
         place = self._world.points_of(self._world.covisible(ids, _PLACE))
@@ -65,13 +72,16 @@ class LoopVerifier:
         if T is None:
             return None
         new = [keyframe.index, *(k.index for k, _ in neighbors)]
-        # The neighbours' own answers stand for themselves: an error in one edge is then not repeated in all.
+        # The neighbours' own answers stand for themselves: an error in one edge is then not
+        # repeated in all.
         Ts = [T, *(pose @ inverse(old.T_cw) for _, pose in neighbors)]
         return Loop(old.index, np.array(new), np.stack(Ts))
 
-    def _locate(self, keyframe: Keyframe, ids: NDArray[np.int64], place: NDArray[np.int64]) -> Array | None:
-        """T_cw of a keyframe as if nothing were known about where it is: from points `ids` of an old place by their
-        descriptors, then from all its points."""
+    def _locate(
+        self, keyframe: Keyframe, ids: NDArray[np.int64], place: NDArray[np.int64]
+    ) -> Array | None:
+        """T_cw of a keyframe as if nothing were known about where it is: from points `ids` of an
+        old place by their descriptors, then from all its points."""
         world, features = self._world, keyframe.features.without_subpixel
         rough = self._ransac(features, match_descriptors(ids, world.descriptors[ids], features))
         if rough is None:
@@ -80,12 +90,17 @@ class LoopVerifier:
         for radius in (10.0, 5.0):
             matches = match_projected(world.project(place, T_cw), features, radius)
             seen = observations(features, matches.keypoints)
-            T_cw, inlier = optimize_pose(T_cw, world.positions[matches.points], seen, self._reprojection)
+            T_cw, inlier = optimize_pose(
+                T_cw, world.positions[matches.points], seen, self._reprojection
+            )
             inliers = int(inlier.sum())
         return T_cw if inliers >= _MIN_INLIERS else None
 
     def _ransac(self, features: Features, matches: Matches) -> Array | None:
-        points, seen = self._world.positions[matches.points], observations(features, matches.keypoints)
+        points, seen = (
+            self._world.positions[matches.points],
+            observations(features, matches.keypoints),
+        )
         if len(matches) < _MIN_ROUGH:
             return None
         found = ransac_pose(points, seen, self._world.camera, self._rng, _HYPOTHESES)
@@ -94,9 +109,17 @@ class LoopVerifier:
         T_cw, agree = found
         return optimize_pose(T_cw, points[agree], seen.take(agree), self._reprojection, rounds=1)[0]
 
-    def _agreeing(self, keyframe: Keyframe, T_cw: Array, place: NDArray[np.int64]) -> list[tuple[Keyframe, Array]]:
-        """Neighbours of the keyframe that, asked by themselves, find it in the same spot; with their own poses."""
-        around = [k for k in self._world.covisible(keyframe.seen_points(), _NEIGHBORS + 1) if k is not keyframe]
+    def _agreeing(
+        self, keyframe: Keyframe, T_cw: Array, place: NDArray[np.int64]
+    ) -> list[tuple[Keyframe, Array]]:
+        """Neighbours of the keyframe that, asked by themselves, find it in the same spot; with
+        their own poses.
+        """
+        around = [
+            k
+            for k in self._world.covisible(keyframe.seen_points(), _NEIGHBORS + 1)
+            if k is not keyframe
+        ]
         result = []
         for neighbor in around[:_NEIGHBORS]:
             own = self._locate(neighbor, place, place)

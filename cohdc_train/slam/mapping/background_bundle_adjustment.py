@@ -1,8 +1,9 @@
 """Local bundle adjustment beside tracking, so that tracking never waits for it.
 
-No two threads ever touch the map. The tracker's thread takes arrays out of it (`open_window`), a worker process does
-the sums on its own copy, and the tracker's thread, between two frames, puts the result in (`close_window`). One window
-is under way at a time; a keyframe that joins meanwhile waits, and a newer one takes its place.
+No two threads ever touch the map. The tracker's thread takes arrays out of it (`open_window`), a
+worker process does the sums on its own copy, and the tracker's thread, between two frames, puts the
+result in (`close_window`). One window is under way at a time; a keyframe that joins meanwhile
+waits, and a newer one takes its place.
 """
 
 from concurrent.futures import Executor, Future
@@ -11,7 +12,13 @@ import numpy as np
 
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
-from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, Window, close_window, open_window, solve
+from cohdc_train.slam.mapping.local_bundle_adjustment import (
+    Solution,
+    Window,
+    close_window,
+    open_window,
+    solve,
+)
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
@@ -29,7 +36,11 @@ class BackgroundMapper:
     def busy_with(self) -> set[int]:
         """Indices of the keyframes that must stay in the map until `collect` has had them."""
         waiting = set() if self._waiting is None else {self._waiting.index}
-        return waiting if self._running is None else waiting | {k.index for k in self._running[0].keyframes}
+        return (
+            waiting
+            if self._running is None
+            else waiting | {k.index for k in self._running[0].keyframes}
+        )
 
     def start(self, world: Map, keyframe: Keyframe) -> None:
         """Adjust the keyframe's window as soon as the one under way is done."""
@@ -42,7 +53,9 @@ class BackgroundMapper:
         self._running = window, job
 
     def collect(self, world: Map) -> Array | None:
-        """Put a finished result into the map. Returns the motion of `close_window`, None when there is none."""
+        """Put a finished result into the map. Returns the motion of `close_window`, None when there
+        is none.
+        """
         if self._running is None or not self._running[1].done():
             return None
         window, job = self._running

@@ -1,4 +1,6 @@
-"""Every tracked frame, by where it lies from a keyframe: keyframes move later on, and take it along."""
+"""Every tracked frame, by where it lies from a keyframe: keyframes move later on, and take it
+along.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,8 +14,9 @@ from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
 
 
 class _Logged(NamedTuple):
-    """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in it, m; information:
-    [6, 6] inverse covariance of the pose; pull: [6] gradient of what was expected of it."""
+    """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in
+    it, m; information: [6, 6] inverse covariance of the pose; pull: [6] gradient of what was
+    expected of it."""
 
     t: float
     reference: int
@@ -28,10 +31,19 @@ class FrameHistory:
     def __init__(self) -> None:
         self._frames: list[_Logged] = []
 
-    def append(self, t: float, T_cw: Array, reference: Keyframe, information: Array, pull: Array, world: Map) -> int:
+    def append(
+        self,
+        t: float,
+        T_cw: Array,
+        reference: Keyframe,
+        information: Array,
+        pull: Array,
+        world: Map,
+    ) -> int:
         """Append the frame at t, s. Returns its row.
 
-        T_cw: [4, 4] world to camera, m; reference: the keyframe it stays relative to; information, pull: as `_Logged`.
+        T_cw: [4, 4] world to camera, m; reference: the keyframe it stays relative to; information,
+        pull: as `_Logged`.
         """
         relative = T_cw @ inverse(world.pose(reference.index))
         self._frames.append(_Logged(t, reference.index, relative, information, pull))
@@ -59,9 +71,13 @@ class FrameHistory:
             self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
 
     def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
-        """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has them now."""
+        """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has
+        them now.
+        """
         stamps, poses = self.stamps, self.poses(world)
         if smooth and len(poses):
             information = np.stack([frame.information for frame in self._frames])
-            poses = smoothed(stamps, poses, information, np.stack([frame.pull for frame in self._frames]))
+            poses = smoothed(
+                stamps, poses, information, np.stack([frame.pull for frame in self._frames])
+            )
         return stamps, inverse(poses)

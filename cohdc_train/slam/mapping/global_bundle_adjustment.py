@@ -1,7 +1,7 @@
 """The adjustment when a sequence is over: all keyframes, and what frames between them saw.
 
-A keyframe every half second is what mapping has time for on the way. The frames between have seen every point ten times
-more often.
+A keyframe every half second is what mapping has time for on the way. The frames between have seen
+every point ten times more often.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,12 @@ from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.frame_history import FrameHistory
 from cohdc_train.slam.mapping.keyframe import observations
-from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting, close_window, select_window, solve
+from cohdc_train.slam.mapping.local_bundle_adjustment import (
+    Sighting,
+    close_window,
+    select_window,
+    solve,
+)
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel
 
@@ -25,8 +30,8 @@ _TURNS = 2  # a matched frame gives only every second of its points, another one
 
 
 class _Kept(NamedTuple):
-    """row: of the frame in the log; ids: [m] points that it saw; born: [m] keyframe index of each, for a younger point
-    may take the row of one that is gone; seen: the m measurements."""
+    """row: of the frame in the log; ids: [m] points that it saw; born: [m] keyframe index of each,
+    for a younger point may take the row of one that is gone; seen: the m measurements."""
 
     row: int
     ids: NDArray[np.int64]
@@ -43,8 +48,8 @@ class ObservedFrames:
         self._count = 0
 
     def chosen(self, seen: Matches, matched: bool) -> Matches | None:
-        """What is wanted of the next settled frame, if anything; seen: the points it sees; matched: against the map, so
-        that it saw all it can.
+        """What is wanted of the next settled frame, if anything; seen: the points it sees; matched:
+        against the map, so that it saw all it can.
 
         One that saw little is not kept: what it gives would not do for a pose.
         """
@@ -54,7 +59,9 @@ class ObservedFrames:
         number, self._count = self._count, self._count + 1
         if number % self._every:
             return None
-        turn = number.bit_count()  # odd and even by turns, whichever powers of two are left out later on
+        turn = (
+            number.bit_count()
+        )  # odd and even by turns, whichever powers of two are left out later on
         return seen.take((seen.points + turn) % turns == 0)
 
     def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
@@ -66,10 +73,11 @@ class ObservedFrames:
             self._every *= 2
 
     def adjust(self, world: Map, reprojection: ReprojectionModel, log: FrameHistory) -> None:
-        """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are moved in the log;
-        others stay where they lie from their reference keyframes.
+        """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are
+        moved in the log; others stay where they lie from their reference keyframes.
 
-        Without the first step a map that loops have moved is still too far off when the few of the second are over.
+        Without the first step a map that loops have moved is still too far off when the few of the
+        second are over.
         """
         adjust_everything(world, reprojection)
         stamps, keyframes = log.stamps, {keyframe.t for keyframe in world.keyframes}
@@ -78,7 +86,9 @@ class ObservedFrames:
             return
         poses = log.poses(world)
         sightings = [_sighting(kept, poses[kept.row], world) for kept in others]
-        log.put(world, [kept.row for kept in others], adjust_everything(world, reprojection, sightings))
+        log.put(
+            world, [kept.row for kept in others], adjust_everything(world, reprojection, sightings)
+        )
 
 
 def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
@@ -90,9 +100,11 @@ def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
     return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))
 
 
-def adjust_everything(world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()) -> Array:
-    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first keyframe holds
-    still. Returns [s, 4, 4] T_cw of those frames, m."""
+def adjust_everything(
+    world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()
+) -> Array:
+    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first
+    keyframe holds still. Returns [s, 4, 4] T_cw of those frames, m."""
     window = select_window(world, list(world.keyframes), 1, sightings)
     solution = solve(np.stack(window.poses), window.points, window.problem, reprojection)
     close_window(world, window, solution)

@@ -14,9 +14,10 @@ from cohdc_train.slam.optimization.reprojection import Observations
 class Keyframe:
     """A frame the map keeps.
 
-    index: its number, Map.joined when it joins, not used again; t: s; T_cw: [4, 4] world to camera, m; point_ids: [n]
-    int64, the map point of every corner or -1; thumbnail: [h, w] float32, zero mean and unit norm, for finding the
-    place again; nearest: [h, w] coarse depth as Geometry.nearest gives it, m.
+    index: its number, Map.joined when it joins, not used again; t: s; T_cw: [4, 4] world to camera,
+    m; point_ids: [n] int64, the map point of every corner or -1; thumbnail: [h, w] float32, zero
+    mean and unit norm, for finding the place again; nearest: [h, w] coarse depth as
+    Geometry.nearest gives it, m.
     """
 
     index: int
@@ -39,4 +40,6 @@ class Keyframe:
 def observations(features: Features, keypoints: NDArray[np.int64]) -> Observations:
     """What a frame measured at some of its corners."""
     sigmas, depth_sigmas = features.sigmas[keypoints], features.scales[keypoints]
-    return Observations(features.points[keypoints], features.depths[keypoints], sigmas, depth_sigmas)
+    return Observations(
+        features.points[keypoints], features.depths[keypoints], sigmas, depth_sigmas
+    )

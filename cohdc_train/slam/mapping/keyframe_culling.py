@@ -1,4 +1,6 @@
-"""Keyframes that show nothing the others do not show as well go, so that a map grows with the space, not with time."""
+"""Keyframes that show nothing the others do not show as well go, so that a map grows with the
+space, not with time.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +18,13 @@ _COARSER = 1  # pyramid level at which a point is still seen as well
 
 
 def cull_keyframes(world: Map, newest: Keyframe, keep: set[int]) -> list[Keyframe]:
-    """Remove redundant keyframes around the newest (ORB-SLAM's criterion), and points that too few still see.
+    """Remove redundant keyframes around the newest (ORB-SLAM's criterion), and points that too few
+    still see.
 
-    A keyframe goes when at least three others see 90 % of its points at the same scale, a finer or the next coarser.
-    The map's first keyframe stays, and the newest one's window, and those of the indices `keep`. Younger ones go
-    first. What hung on a removed keyframe hangs on the one that shares most points with it. Returns the removed.
+    A keyframe goes when at least three others see 90 % of its points at the same scale, a finer or
+    the next coarser. The map's first keyframe stays, and the newest one's window, and those of the
+    indices `keep`. Younger ones go first. What hung on a removed keyframe hangs on the one that
+    shares most points with it. Returns the removed.
     """
     around = world.covisible(newest.seen_points(), _AROUND)
     ids = world.points_of(around)
@@ -39,7 +43,9 @@ def cull_keyframes(world: Map, newest: Keyframe, keep: set[int]) -> list[Keyfram
 
 
 def _levels(ids: NDArray[np.int64], keyframes: list[Keyframe], size: int) -> NDArray[np.int8]:
-    """[keyframes, ids] at which pyramid level each keyframe sees each point; 2 LEVELS where it does not."""
+    """[keyframes, ids] at which pyramid level each keyframe sees each point; 2 LEVELS where it does
+    not.
+    """
     column = np.full(size + 1, -1)
     column[ids] = np.arange(len(ids))
     levels = np.full((len(keyframes), len(ids)), 2 * LEVELS, dtype=np.int8)
@@ -51,6 +57,8 @@ def _levels(ids: NDArray[np.int64], keyframes: list[Keyframe], size: int) -> NDA
 
 def _remove(world: Map, keyframe: Keyframe) -> None:
     points = keyframe.seen_points()
-    successor = next((k for k in world.covisible(points, 2) if k is not keyframe), world.keyframes[0])
+    successor = next(
+        (k for k in world.covisible(points, 2) if k is not keyframe), world.keyframes[0]
+    )
     world.remove_keyframe(keyframe, successor)
     drop_points(world, points[world.num_observations[points] < MIN_SEEN_BY])

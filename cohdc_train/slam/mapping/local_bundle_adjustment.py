@@ -1,4 +1,5 @@
-"""Bundle adjustment of keyframes, near the newest or all, in three steps: arrays out, the sums, the result back in.
+"""Bundle adjustment of keyframes, near the newest or all, in three steps: arrays out, the sums, the
+result back in.
 
 The middle step touches no map, so it may run elsewhere and later (`background_mapping`).
 """
@@ -23,9 +24,9 @@ FIXED = 3  # of them hold still and carry the frame of reference
 class Window:
     """What a bundle adjustment starts from.
 
-    keyframes: [k] the newest last; poses: [c, 4, 4] T_cw, m, as they were, of the keyframes and then of c - k other
-    frames; ids: [p] map points; points: [p, 3] world, m, as they were; problem: m measurements; corners: [m] the
-    keyframe's corner behind each, or the other frame's row.
+    keyframes: [k] the newest last; poses: [c, 4, 4] T_cw, m, as they were, of the keyframes and
+    then of c - k other frames; ids: [p] map points; points: [p, 3] world, m, as they were; problem:
+    m measurements; corners: [m] the keyframe's corner behind each, or the other frame's row.
     """
 
     keyframes: list[Keyframe]
@@ -38,7 +39,8 @@ class Window:
 
 @dataclass(frozen=True)
 class Sighting:
-    """What a frame that is no keyframe saw. T_cw: [4, 4] world to camera, m; ids: [m] map points, none of them twice;
+    """What a frame that is no keyframe saw. T_cw: [4, 4] world to camera, m; ids: [m] map points,
+    none of them twice;
     seen: the m measurements, as of points that surely stand still."""
 
     T_cw: Array
@@ -62,8 +64,12 @@ def open_window(world: Map, keyframe: Keyframe) -> Window:
     return select_window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
 
 
-def select_window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()) -> Window:
-    """Keyframes, the newest last, of which the first few are fixed, with all measurements of the others' points."""
+def select_window(
+    world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()
+) -> Window:
+    """Keyframes, the newest last, of which the first few are fixed, with all measurements of the
+    others' points.
+    """
     ids = world.points_of(keyframes[fixed:])
     row = np.full(world.size + 1, -1)
     row[ids] = np.arange(len(ids))
@@ -83,8 +89,12 @@ def select_window(world: Map, keyframes: list[Keyframe], fixed: int, sightings: 
     return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(keypoints))
 
 
-def solve(poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel) -> Solution:
-    """Robustly first, then once more without the measurements that do not fit. Arrays as in `Window`."""
+def solve(
+    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel
+) -> Solution:
+    """Robustly first, then once more without the measurements that do not fit. Arrays as in
+    `Window`.
+    """
     poses, points = adjust(poses, points, problem, reprojection, steps=5)
     good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
     poses, points = adjust(poses, points, problem.take(good), reprojection, steps=3, robust=False)
@@ -95,10 +105,11 @@ def solve(poses: Array, points: Array, problem: Problem, reprojection: Reproject
 def close_window(world: Map, window: Window, solution: Solution) -> Array | None:
     """Put a solution into the map; measurements that do not fit are dropped.
 
-    The map may have changed since the window was opened: what was added moves along with the window's newest keyframe.
-    No keyframe of the window may have been removed.
-    Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and nothing is done, when
-    somebody else moved one of the keyframes in the meantime (a loop was closed).
+    The map may have changed since the window was opened: what was added moves along with the
+    window's newest keyframe. No keyframe of the window may have been removed.
+    Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and
+    nothing is done, when somebody else moved one of the keyframes in the meantime (a loop was
+    closed).
     """
     if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=False)):
         return None
@@ -110,7 +121,9 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
             keyframe.T_cw = keyframe.T_cw @ motion
     added = np.flatnonzero(world.first_keyframe[: world.size] > newest)
     world.positions[added] = to_local(inverse(motion), world.positions[added])
-    same = world.first_keyframe[window.ids] <= newest  # a younger point may have taken the row of one that is gone
+    same = (
+        world.first_keyframe[window.ids] <= newest
+    )  # a younger point may have taken the row of one that is gone
     world.positions[window.ids[same]] = solution.points[same]
     for slot, member in enumerate(window.keyframes):
         member.T_cw = solution.poses[slot]
@@ -121,6 +134,10 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
 
 
 def adjust_window(world: Map, keyframe: Keyframe, reprojection: ReprojectionModel) -> None:
-    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not fit are dropped."""
+    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not
+    fit are dropped.
+    """
     window = open_window(world, keyframe)
-    close_window(world, window, solve(np.stack(window.poses), window.points, window.problem, reprojection))
+    close_window(
+        world, window, solve(np.stack(window.poses), window.points, window.problem, reprojection)
+    )

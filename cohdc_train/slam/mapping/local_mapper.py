@@ -36,9 +36,11 @@ class LoopCloserLike(Protocol):
 class LocalMapper:
     """Takes keyframes into a map and puts it in order.
 
-    refiner: cuts out the patches of new points; loop_closer: closes loops with every keyframe, None closes none;
-    executor: where bundle adjustment runs, in parallel with tracking (`background_bundle_adjustment`), None waits for
-    it; in_parts: what can wait is done by `work`, a part at a time.
+    refiner: cuts out the patches of new points; loop_closer: closes loops with every keyframe, None
+    closes none;
+    executor: where bundle adjustment runs, in parallel with tracking
+    (`background_bundle_adjustment`), None waits for it; in_parts: what can wait is done by `work`,
+    a part at a time.
     """
 
     def __init__(
@@ -70,8 +72,8 @@ class LocalMapper:
         return bool(self._parts)
 
     def insert(self, keyframe: Keyframe, picture: Callable[[], DepthImage]) -> None:
-        """A tracked keyframe joins, and its corners of known depth become points. Then: duplicates merged, bundle
-        adjustment, weak points out; loops, superfluous keyframes out.
+        """A tracked keyframe joins, and its corners of known depth become points. Then: duplicates
+        merged, bundle adjustment, weak points out; loops, superfluous keyframes out.
 
         picture: makes what loop closing keeps of it. Must not be called while `busy`.
         """
@@ -80,7 +82,9 @@ class LocalMapper:
         add_points(self._world, keyframe)
         if self._refiner is not None:
             self._refiner.remember(keyframe)
-        self._parts.extend([lambda: self._settle(keyframe), lambda: self._look_back(keyframe, picture)])
+        self._parts.extend(
+            [lambda: self._settle(keyframe), lambda: self._look_back(keyframe, picture)]
+        )
         if not self._in_parts:
             self._finish_parts()
 

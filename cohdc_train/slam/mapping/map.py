@@ -14,13 +14,17 @@ _NEAR = 0.1  # m
 _OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
 _NEIGHBORS = 64  # keyframes that are looked at when those that share most points are sought
 _STILL = 3.0  # log-odds that a new point stands still
-_WENT, _STOOD, _CERTAIN = 2.0, 0.25, 8.0  # log-odds of moving: more per frame that says so, less per frame, at most
+_WENT, _STOOD, _CERTAIN = (
+    2.0,
+    0.25,
+    8.0,
+)  # log-odds of moving: more per frame that says so, less per frame, at most
 _VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
 
 
 class Map:
-    """Points live in arrays that grow by doubling; an id is a row, which a new point takes when no keyframe sees the
-    one in it any more.
+    """Points live in arrays that grow by doubling; an id is a row, which a new point takes when no
+    keyframe sees the one in it any more.
 
     keyframes: those that are in the map, index rising; joined: how many ever were.
     """
@@ -30,14 +34,22 @@ class Map:
         self.keyframes: list[Keyframe] = []
         self.joined = 0
         self._by_index: dict[int, Keyframe] = {}
-        self._successors: dict[int, tuple[int, Array]] = {}  # of removed keyframes: whom each hangs on, and by what
+        self._successors: dict[
+            int, tuple[int, Array]
+        ] = {}  # of removed keyframes: whom each hangs on, and by what
         self.size = 0
         self.positions = np.zeros((1024, 3))
         self.descriptors = np.zeros((1024, 4), dtype=np.uint64)
-        self.directions = np.zeros((1024, 3))  # sum of unit vectors from camera centres to the point
-        self.reach = np.zeros(1024)  # m: from further away not even the finest level shows the point
+        self.directions = np.zeros(
+            (1024, 3)
+        )  # sum of unit vectors from camera centres to the point
+        self.reach = np.zeros(
+            1024
+        )  # m: from further away not even the finest level shows the point
         self.num_observations = np.zeros(1024, dtype=np.int64)  # keyframes
-        self.observers = np.zeros((1024, _OBSERVERS), dtype=np.int32)  # keyframe index + 1, 0 = none, in any order
+        self.observers = np.zeros(
+            (1024, _OBSERVERS), dtype=np.int32
+        )  # keyframe index + 1, 0 = none, in any order
         self.first_keyframe = np.zeros(1024, dtype=np.int64)  # keyframe index
         self.merged_into = np.full(1024, -1)  # the point that took over the one in this row
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
@@ -52,7 +64,8 @@ class Map:
         self._add_observer(keyframe.seen_points(), keyframe)
 
     def remove_keyframe(self, keyframe: Keyframe, successor: Keyframe) -> None:
-        """Take out a keyframe; what hung on it, frames and points, hangs on another from now on, where it is now.
+        """Take out a keyframe; what hung on it, frames and points, hangs on another from now on,
+        where it is now.
 
         The directions its points were seen from stay known.
         """
@@ -62,7 +75,8 @@ class Map:
         self._successors[keyframe.index] = successor.index, keyframe.T_cw @ inverse(successor.T_cw)
 
     def anchor(self, index: int) -> tuple[Keyframe, Array]:
-        """Return the keyframe that another one is relative to, and [4, 4] from its camera to the other's, m.
+        """Return the keyframe that another one is relative to, and [4, 4] from its camera to the
+        other's, m.
 
         It is the keyframe itself while it is in the map, and else its successor.
         """
@@ -97,7 +111,9 @@ class Map:
         self.observe(keyframe, Matches(ids, keypoints))
 
     def observe(self, keyframe: Keyframe, matches: Matches) -> None:
-        """Corners of a keyframe, free so far, are measurements of points, held against none of their patches."""
+        """Corners of a keyframe, free so far, are measurements of points, held against none of
+        their patches.
+        """
         keyframe.point_ids[matches.keypoints] = matches.points
         keyframe.features.is_subpixel[matches.keypoints] = False
         self._add_observer(matches.points, keyframe)
@@ -106,14 +122,19 @@ class Map:
         """Corners of a keyframe are no measurements of their points."""
         ids = keyframe.point_ids[keypoints]
         np.subtract.at(self.num_observations, ids, 1)
-        self.observers[ids] = np.where(self.observers[ids] == keyframe.index + 1, 0, self.observers[ids])
+        self.observers[ids] = np.where(
+            self.observers[ids] == keyframe.index + 1, 0, self.observers[ids]
+        )
         keyframe.point_ids[keypoints] = -1
 
-    def replace(self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
-        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one corner per point.
+    def replace(
+        self, old: NDArray[np.int64], new: NDArray[np.int64], keyframes: list[Keyframe]
+    ) -> None:
+        """Points `old` are the points `new`: their measurements move over; a keyframe keeps one
+        corner per point.
 
-        The log-odds of having moved become the larger of both: the same frames have judged them, so that their sum
-        would count what a group did twice.
+        The log-odds of having moved become the larger of both: the same frames have judged them, so
+        that their sum would count what a group did twice.
         """
         np.maximum.at(self.moved, new, self.moved[old])
         self.merged_into[old] = new
@@ -134,17 +155,23 @@ class Map:
             self.observe(keyframe, Matches(successors[keep], changed[keep]))
 
     def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """[n] what the points `ids` have become, by however many steps: themselves where none took them over."""
+        """[n] what the points `ids` have become, by however many steps: themselves where none took
+        them over.
+        """
         while True:
             successors = self.merged_into[ids]
             # Where the successor's row holds a younger point, the successor is gone.
-            taken = (successors >= 0) & (self.first_keyframe[successors] <= self.first_keyframe[ids])
+            taken = (successors >= 0) & (
+                self.first_keyframe[successors] <= self.first_keyframe[ids]
+            )
             if not taken.any():
                 return ids
             ids = np.where(taken, successors, ids)
 
     def trust(self, ids: NDArray[np.int64]) -> Array:
-        """[n] probability that each point stands still, as a share of a new point's: its weight, above 0 up to 1."""
+        """[n] probability that each point stands still, as a share of a new point's: its weight,
+        above 0 up to 1.
+        """
         return np.asarray((1 + np.exp(-_STILL)) / (1 + np.exp(self.moved[ids] - _STILL)))
 
     def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
@@ -166,8 +193,8 @@ class Map:
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
 
-        Only the 64 that occur most often among the points' observers are looked at, so that the time this takes
-        does not grow with the map.
+        Only the 64 that occur most often among the points' observers are looked at, so that the
+        time this takes does not grow with the map.
         """
         often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
         near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBORS])
@@ -186,16 +213,22 @@ class Map:
         return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
 
     def move(self, poses: Array) -> None:
-        """Keyframes go to poses [keyframes, 4, 4] T_cw, m, and every point goes along with the one it was born in."""
+        """Keyframes go to poses [keyframes, 4, 4] T_cw, m, and every point goes along with the one
+        it was born in.
+        """
         motions = inverse(poses) @ np.stack([k.T_cw for k in self.keyframes])
         row = {keyframe.index: i for i, keyframe in enumerate(self.keyframes)}
         first_keyframe, which = np.unique(self.first_keyframe[: self.size], return_inverse=True)
-        motion = motions[[row[self.anchor(index)[0].index] for index in first_keyframe.tolist()]][which]
+        motion = motions[[row[self.anchor(index)[0].index] for index in first_keyframe.tolist()]][
+            which
+        ]
         for keyframe, T_cw in zip(self.keyframes, poses, strict=True):
             keyframe.T_cw = T_cw
         moved = np.einsum("nij,nj->ni", motion[:, :3, :3], self.positions[: self.size])
         self.positions[: self.size] = moved + motion[:, :3, 3]
-        self.directions[: self.size] = np.einsum("nij,nj->ni", motion[:, :3, :3], self.directions[: self.size])
+        self.directions[: self.size] = np.einsum(
+            "nij,nj->ni", motion[:, :3, :3], self.directions[: self.size]
+        )
 
     def points_of(self, keyframes: list[Keyframe]) -> NDArray[np.int64]:
         """Ids of the points that any of the keyframes sees, rising."""
@@ -216,11 +249,15 @@ class Map:
         camera, local = self.camera, to_local(T_cw, self.positions[ids])
         z = np.maximum(local[:, 2], _NEAR)
         u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
-        inside = (local[:, 2] > _NEAR) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        inside = (
+            (local[:, 2] > _NEAR) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        )
         ids, local = ids[inside], local[inside]
         distance = np.sqrt(np.einsum("nj,nj->n", local, local))
         sums = self.directions[ids]
-        along = np.einsum("nj,nj->n", local @ T_cw[:3, :3], sums)  # cosine times distance times length of the sum
+        along = np.einsum(
+            "nj,nj->n", local @ T_cw[:3, :3], sums
+        )  # cosine times distance times length of the sum
         level = np.log(np.maximum(self.reach[ids], 1e-9) / distance) / np.log(SCALE)
         seen = along > _VIEW_COSINE * distance * np.sqrt(np.einsum("nj,nj->n", sums, sums))
         seen &= (level > -1.0) & (level < LEVELS)
@@ -229,7 +266,9 @@ class Map:
         return Projected(ids[seen], pixels, levels, self.descriptors[ids[seen]])
 
     def _add_observer(self, ids: NDArray[np.int64], keyframe: Keyframe) -> None:
-        self.observers[ids, self.observers[ids].argmin(axis=1)] = keyframe.index + 1  # a free place, or the oldest's
+        self.observers[ids, self.observers[ids].argmin(axis=1)] = (
+            keyframe.index + 1
+        )  # a free place, or the oldest's
         self.num_observations[ids] += 1
         offset = self.positions[ids] - keyframe.center()
         self.directions[ids] += offset / (np.linalg.norm(offset, axis=1, keepdims=True) + 1e-12)
@@ -244,7 +283,15 @@ class Map:
         return ids
 
     def _reserve(self, count: int) -> None:
-        counters = ("num_observations", "observers", "first_keyframe", "merged_into", "visible", "found", "moved")
+        counters = (
+            "num_observations",
+            "observers",
+            "first_keyframe",
+            "merged_into",
+            "visible",
+            "found",
+            "moved",
+        )
         names = ("positions", "descriptors", "directions", "reach", *counters)
         while len(self.positions) < count:
             for name in names:

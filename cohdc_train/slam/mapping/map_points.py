@@ -1,4 +1,6 @@
-"""What a keyframe that joins brings: new points, duplicates merged, local bundle adjustment, weak points out."""
+"""What a keyframe that joins brings: new points, duplicates merged, local bundle adjustment, weak
+points out.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,9 @@ def add_points(world: Map, keyframe: Keyframe) -> None:
 
 
 def fuse(world: Map, keyframe: Keyframe) -> None:
-    """Look for the keyframe's points in its neighbours: more measurements; duplicates become the older point."""
+    """Look for the keyframe's points in its neighbours: more measurements; duplicates become the
+    older point.
+    """
     ids = keyframe.seen_points()
     neighbors = [k for k in world.covisible(ids, _FUSE_KEYFRAMES + 1) if k is not keyframe]
     pairs = [_look_for(world, ids, other) for other in neighbors]
@@ -29,13 +33,18 @@ def fuse(world: Map, keyframe: Keyframe) -> None:
         _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbors])
 
 
-def fuse_into(world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]) -> None:
-    """Look for points in one keyframe that may not know them yet; `keyframes` are all that may hold duplicates."""
+def fuse_into(
+    world: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]
+) -> None:
+    """Look for points in one keyframe that may not know them yet; `keyframes` are all that may hold
+    duplicates.
+    """
     _merge(world, _look_for(world, ids, other), keyframes)
 
 
 def _look_for(world: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np.int64]:
-    """Look for points in one keyframe, where they become measurements of corners that belong to none.
+    """Look for points in one keyframe, where they become measurements of corners that belong to
+    none.
 
     Returns [2, k] such points, and those that their corners belong to.
     """
@@ -53,7 +62,9 @@ def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> N
     if len(first) == 0:
         return
     later = world.first_keyframe[first] - world.first_keyframe[second]
-    older = np.where(later == 0, first < second, later < 0)  # one order of all points, so that no two swap places
+    older = np.where(
+        later == 0, first < second, later < 0
+    )  # one order of all points, so that no two swap places
     old, new = np.where(older, second, first), np.where(older, first, second)
     gives_way = np.zeros(world.size, dtype=np.bool_)
     gives_way[old] = True
@@ -62,11 +73,16 @@ def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> N
 
 
 def cull(world: Map, newest: int) -> None:
-    """Drop young points that few keyframes confirmed or that frames rarely found where they should be."""
+    """Drop young points that few keyframes confirmed or that frames rarely found where they should
+    be.
+    """
     young = np.flatnonzero(
-        (world.first_keyframe[: world.size] >= newest - _TRIAL) & (world.num_observations[: world.size] > 0)
+        (world.first_keyframe[: world.size] >= newest - _TRIAL)
+        & (world.num_observations[: world.size] > 0)
     )
-    weak = (world.first_keyframe[young] == newest - _TRIAL) & (world.num_observations[young] < MIN_SEEN_BY)
+    weak = (world.first_keyframe[young] == newest - _TRIAL) & (
+        world.num_observations[young] < MIN_SEEN_BY
+    )
     weak |= world.found[young] < _MIN_FOUND * world.visible[young]
     drop_points(world, young[weak])
 

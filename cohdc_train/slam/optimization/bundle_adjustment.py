@@ -1,4 +1,6 @@
-"""Bundle adjustment: Levenberg-Marquardt over poses and points, points eliminated by the Schur complement."""
+"""Bundle adjustment: Levenberg-Marquardt over poses and points, points eliminated by the Schur
+complement.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,7 +25,8 @@ from cohdc_train.slam.optimization.reprojection import (
 class Problem:
     """Which camera saw which point. No camera sees a point twice.
 
-    cameras: [m] int64 index into the poses, sorted; points: [m] int64 index into the points; seen: the m measurements;
+    cameras: [m] int64 index into the poses, sorted; points: [m] int64 index into the points; seen:
+    the m measurements;
     free: [c] bool, which poses may move.
     """
 
@@ -49,7 +52,9 @@ class _Normal:
 
     camera: Array  # [c, 6, 6]
     point: Array  # [p, 3, 3]
-    mixed: sparse.bsr_array  # [c * 6, p * 3]: a block of 6 x 3 for every measurement by a free camera
+    mixed: (
+        sparse.bsr_array
+    )  # [c * 6, p * 3]: a block of 6 x 3 for every measurement by a free camera
     camera_gradient: Array  # [c, 6]
     point_gradient: Array  # [p, 3]
 
@@ -64,7 +69,9 @@ def local_points(poses: Array, points: Array, problem: Problem) -> Array:
     return result
 
 
-def measurement_chi2(poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel) -> Array:
+def measurement_chi2(
+    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel
+) -> Array:
     """[m] squared residual in sigmas; infinite where the point lies behind the camera."""
     local = local_points(poses, points, problem)
     error = residuals(local, problem.seen, reprojection)
@@ -72,12 +79,18 @@ def measurement_chi2(poses: Array, points: Array, problem: Problem, reprojection
 
 
 def adjust(
-    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, steps: int = 8, robust: bool = True
+    poses: Array,
+    points: Array,
+    problem: Problem,
+    reprojection: ReprojectionModel,
+    steps: int = 8,
+    robust: bool = True,
 ) -> tuple[Array, Array]:
     """Minimise the (Huber) cost of all measurements over the free poses and all points.
 
-    poses: [c, 4, 4] T_cw; points: [p, 3] world, m. Returns both, improved; the cost never rises. At least one pose
-    must be fixed, or depth measured, for the problem to have one answer; damping keeps the step finite in any case.
+    poses: [c, 4, 4] T_cw; points: [p, 3] world, m. Returns both, improved; the cost never rises. At
+    least one pose must be fixed, or depth measured, for the problem to have one answer; damping
+    keeps the step finite in any case.
     """
     damping = 1e-4
     cost = _cost(poses, points, problem, reprojection, robust)
@@ -98,7 +111,9 @@ def adjust(
     return poses, points
 
 
-def _cost(poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, robust: bool) -> float:
+def _cost(
+    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, robust: bool
+) -> float:
     error = residuals(local_points(poses, points, problem), problem.seen, reprojection)
     chi2 = np.einsum("mi,mi->m", error, error)
     if not robust:
@@ -123,7 +138,10 @@ def _normal_equations(
     point, point_gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
     ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
     for rows in (slice(*pair) for pair in pairwise(ends)):
-        ids, J = problem.points[rows], by_point[rows]  # a camera sees a point once, so += may index with an array
+        ids, J = (
+            problem.points[rows],
+            by_point[rows],
+        )  # a camera sees a point once, so += may index with an array
         point[ids] += J.transpose(0, 2, 1) @ J
         point_gradient[ids] += np.einsum("mij,mi->mj", J, error[rows])
     for slot, index in enumerate(free):
@@ -134,7 +152,9 @@ def _normal_equations(
     moves = problem.free[problem.cameras]
     blocks = by_pose[moves].transpose(0, 2, 1) @ by_point[moves]
     lengths = np.concatenate([[0], np.cumsum(np.diff(ends)[free])])
-    mixed = sparse.bsr_array((blocks, problem.points[moves], lengths), shape=(6 * len(free), 3 * count))
+    mixed = sparse.bsr_array(
+        (blocks, problem.points[moves], lengths), shape=(6 * len(free), 3 * count)
+    )
     return _Normal(camera, point, mixed, camera_gradient, point_gradient)
 
 

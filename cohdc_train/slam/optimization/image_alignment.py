@@ -1,11 +1,14 @@
-"""Inverse compositional alignment of a local picture to the map's (paper section 2.3, equations 10 to 12).
+"""Inverse compositional alignment of a local picture to the map's (paper section 2.3, equations 10
+to 12).
 
 Where this departs from the paper:
-- its warp is a euclidean motion (x, y, theta) of whole map images. Pictures of a room have parallax, so that such a
-  motion has no metric meaning; here the warp W(x; p) carries a pixel x of the map's picture, through its measured
-  depth, by a rigid motion p of six parameters into the local picture;
-- equation 11 squares the residual and leaves out the transpose: misprints, for a squared residual has no sign. The step
-  of Gauss-Newton is H^-1 times the sum of steepest-descent^T times the residual;
+- its warp is a euclidean motion (x, y, theta) of whole map images. Pictures of a room have
+  parallax, so that such a motion has no metric meaning; here the warp W(x; p) carries a pixel x of
+  the map's picture, through its measured depth, by a rigid motion p of six parameters into the
+  local picture;
+- equation 11 squares the residual and leaves out the transpose: misprints, for a squared residual
+  has no sign. The step of Gauss-Newton is H^-1 times the sum of steepest-descent^T times the
+  residual;
 - equation 12 adds the step to p; motions do not add, so W is composed with the inverse of the step.
 """
 
@@ -31,10 +34,11 @@ _FEWEST = 200  # px that must be seen in both pictures
 class Alignment:
     """How two pictures fit.
 
-    T: [4, 4] camera of the map's picture to camera of the local one, m; before, after: mean clipped photometric error,
-    in standard deviations of the map's picture; correlation: -1..1 of the two pictures where both see the same;
-    overlap: share of the map's pixels that the local picture sees at the depth they should have; agreement: the same
-    share of those pixels that fall on a depth reading at all.
+    T: [4, 4] camera of the map's picture to camera of the local one, m; before, after: mean clipped
+    photometric error, in standard deviations of the map's picture; correlation: -1..1 of the two
+    pictures where both see the same;
+    overlap: share of the map's pixels that the local picture sees at the depth they should have;
+    agreement: the same share of those pixels that fall on a depth reading at all.
     """
 
     T: Array
@@ -80,7 +84,9 @@ class _Template:
         pixels = np.stack([columns, rows], axis=1).astype(np.float64)
         self.points = camera.backproject(pixels, depth[rows, columns].astype(np.float64))
         self.values = picture.gray[rows, columns].astype(np.float64)
-        vertical, horizontal = (np.gradient(picture.gray.astype(np.float64), axis=axis) for axis in (0, 1))
+        vertical, horizontal = (
+            np.gradient(picture.gray.astype(np.float64), axis=axis) for axis in (0, 1)
+        )
         gradient = np.stack([horizontal, vertical], axis=-1)[rows, columns]
         self.descent = np.einsum("xi,xij->xj", gradient, warp_jacobian(self.points, camera))
 
@@ -91,8 +97,12 @@ def warp_jacobian(points: Array, camera: Camera) -> Array:
     result = np.zeros((len(points), 2, 6))
     result[:, 0, 0], result[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
     result[:, 1, 1], result[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-    result[:, 0, 3:] = np.stack([-camera.fx * x * y / z**2, camera.fx * (1 + (x / z) ** 2), -camera.fx * y / z], axis=1)
-    result[:, 1, 3:] = np.stack([-camera.fy * (1 + (y / z) ** 2), camera.fy * x * y / z**2, camera.fy * x / z], axis=1)
+    result[:, 0, 3:] = np.stack(
+        [-camera.fx * x * y / z**2, camera.fx * (1 + (x / z) ** 2), -camera.fx * y / z], axis=1
+    )
+    result[:, 1, 3:] = np.stack(
+        [-camera.fy * (1 + (y / z) ** 2), camera.fy * x * y / z**2, camera.fy * x / z], axis=1
+    )
     return result
 
 
@@ -100,8 +110,9 @@ def warp_jacobian(points: Array, camera: Camera) -> Array:
 class _Comparison:
     """A template in a local picture.
 
-    seen: [x] bool, which pixels both see; template, sampled: [s] their grey values in both, the latter with the gain
-    and offset of the former; residual: [s] clipped; error, overlap, agreement: as in Alignment.
+    seen: [x] bool, which pixels both see; template, sampled: [s] their grey values in both, the
+    latter with the gain and offset of the former; residual: [s] clipped; error, overlap, agreement:
+    as in Alignment.
     """
 
     seen: NDArray[np.bool_]
@@ -130,7 +141,9 @@ def _compare(template: _Template, local: DepthImage, T: Array) -> _Comparison | 
     error = float(np.minimum(np.abs(residual), spread).mean()) / spread
     share = float(seen.sum())
     residual = np.clip(residual, -limit, limit)
-    return _Comparison(seen, values, sampled, residual, error, share / len(seen), share / float(with_reading.sum()))
+    return _Comparison(
+        seen, values, sampled, residual, error, share / len(seen), share / float(with_reading.sum())
+    )
 
 
 def _sample(image: NDArray[np.float32], pixels: Array, interpolation: int) -> Array:
@@ -147,7 +160,9 @@ def _align_level(template: _Template, local: DepthImage, T: Array) -> Array | No
             return None
         descent = template.descent[now.seen]
         H = descent.T @ descent + 1e-9 * np.eye(6)  # equation 10
-        step = np.linalg.solve(H, descent.T @ now.residual)  # equation 11, see above; the residual is I_LM(W) - I_PM
+        step = np.linalg.solve(
+            H, descent.T @ now.residual
+        )  # equation 11, see above; the residual is I_LM(W) - I_PM
         T = T @ inverse(exp_se3(step))  # equation 12, composed
         if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
             break

@@ -1,8 +1,10 @@
-"""Robust least squares on reprojection and depth: one camera's pose, and bundle adjustment with a Schur complement.
+"""Robust least squares on reprojection and depth: one camera's pose, and bundle adjustment with a
+Schur complement.
 
-A pose is T_cw: [4, 4] world to camera, m. It is updated from the left, T <- exp(xi) T, xi = (translation, rotation).
-The residual of an observation has three rows: both pixel coordinates and bf / z, a disparity that a baseline b would
-see, so that depth too is weighed in px. Rows of depth that were not measured weigh nothing.
+A pose is T_cw: [4, 4] world to camera, m. It is updated from the left, T <- exp(xi) T, xi =
+(translation, rotation). The residual of an observation has three rows: both pixel coordinates and
+bf / z, a disparity that a baseline b would see, so that depth too is weighed in px. Rows of depth
+that were not measured weigh nothing.
 """
 
 import cv2
@@ -30,10 +32,12 @@ def optimize_pose(
     rounds: int = 2,
     prior: Prior | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Gauss-Newton on the six parameters of a pose, Huber-weighted; outliers are dropped and may return every round.
+    """Gauss-Newton on the six parameters of a pose, Huber-weighted; outliers are dropped and may
+    return every round.
 
-    T_cw: [4, 4] start; points: [m, 3] world, m; rounds: how often outliers are chosen; prior: what was expected, which
-    counts beside the measurements. Returns the pose and [m] bool, True = inlier at 95 %.
+    T_cw: [4, 4] start; points: [m, 3] world, m; rounds: how often outliers are chosen; prior: what
+    was expected, which counts beside the measurements. Returns the pose and [m] bool, True = inlier
+    at 95 %.
     """
     limits = seen.limits
     used = np.ones(len(points), dtype=np.bool_)
@@ -44,8 +48,12 @@ def optimize_pose(
     return T_cw, used
 
 
-def pose_information(T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
-    """[6, 6] inverse covariance of a pose that these measurements decide; arguments as of optimize_pose."""
+def pose_information(
+    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel
+) -> Array:
+    """[6, 6] inverse covariance of a pose that these measurements decide; arguments as of
+    optimize_pose.
+    """
     local = to_local(T_cw, points)
     J = np.zeros((6, 3, len(points)))
     fill_pose_jacobian(J, local, seen, reprojection)
@@ -54,7 +62,12 @@ def pose_information(T_cw: Array, points: Array, seen: Observations, reprojectio
 
 
 def _refine(
-    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel, prior: Prior | None, steps: int = 8
+    T_cw: Array,
+    points: Array,
+    seen: Observations,
+    reprojection: ReprojectionModel,
+    prior: Prior | None,
+    steps: int = 8,
 ) -> Array:
     limits = seen.limits
     J = np.zeros((6, 3, len(points)))
@@ -72,10 +85,13 @@ def _refine(
         turn = np.asarray(cv2.Rodrigues(step[3:])[0])
         T_cw = T_cw.copy()
         T_cw[:3] = turn @ T_cw[:3]
-        T_cw[:3, 3] += step[:3]  # exp(xi) to first order, which is all that the last, tiny step needs
+        T_cw[:3, 3] += step[
+            :3
+        ]  # exp(xi) to first order, which is all that the last, tiny step needs
         if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
             break
-    # A pose is predicted from the two before, which doubles what rounding took from its rotation; one Newton step back.
+    # A pose is predicted from the two before, which doubles what rounding took from its rotation;
+    # one Newton step back.
     R = T_cw[:3, :3]
     T_cw[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)
     return T_cw

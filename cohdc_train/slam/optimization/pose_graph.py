@@ -1,7 +1,8 @@
-"""Pose-graph optimisation: keyframes as nodes, relative poses as edges, loops under a Cauchy kernel.
+"""Pose-graph optimisation: keyframes as nodes, relative poses as edges, loops under a Cauchy
+kernel.
 
-Own and sparse instead of gtsam: its wheel weighs 34 MB, more than the rest of the SLAM runner, and a graph of this size
-is solved in well under a second here.
+Own and sparse instead of gtsam: its wheel weighs 34 MB, more than the rest of the SLAM runner, and
+a graph of this size is solved in well under a second here.
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from cohdc_train.slam.geometry.se3 import Array, adjoint, adjoint_of_algebra, exp_se3, inverse, log_se3
+from cohdc_train.slam.geometry.se3 import (
+    Array,
+    adjoint,
+    adjoint_of_algebra,
+    exp_se3,
+    inverse,
+    log_se3,
+)
 from cohdc_train.slam.optimization.linear_solver import solve_symmetric
 
 _ROUNDS = 6  # in which the kernel narrows
@@ -22,8 +30,9 @@ _WIDTH = 3.0  # sigmas at which a robust edge has lost half its weight
 class Edges:
     """e measured relative poses.
 
-    first, second: [e] int64 nodes; T: [e, 4, 4] camera of `first` to camera of `second`, m; sigmas: [e, 2] standard
-    deviation of (translation m, rotation rad); robust: [e] bool, whether the edge may be wrong.
+    first, second: [e] int64 nodes; T: [e, 4, 4] camera of `first` to camera of `second`, m; sigmas:
+    [e, 2] standard deviation of (translation m, rotation rad); robust: [e] bool, whether the edge
+    may be wrong.
     """
 
     first: NDArray[np.int64]
@@ -40,13 +49,17 @@ class Edges:
 
 
 def edge_errors(poses: Array, edges: Edges) -> Array:
-    """[e, 6] log of (the relative pose that the nodes have, times the inverse of the measured one), in sigmas."""
+    """[e, 6] log of (the relative pose that the nodes have, times the inverse of the measured one),
+    in sigmas.
+    """
     has = poses[edges.second] @ inverse(poses[edges.first])
     return log_se3(has @ inverse(edges.T)) / np.repeat(edges.sigmas, 3, axis=1)
 
 
 def edge_jacobians(poses: Array, edges: Edges) -> tuple[Array, Array]:
-    """d error / d xi of the first and of the second node, [e, 6, 6] each, to second order in the error."""
+    """d error / d xi of the first and of the second node, [e, 6, 6] each, to second order in the
+    error.
+    """
     scale = np.repeat(edges.sigmas, 3, axis=1)
     ad = adjoint_of_algebra(edge_errors(poses, edges) * scale)
     second = (np.eye(6) - 0.5 * ad + ad @ ad / 12) / scale[:, :, None]
@@ -55,11 +68,12 @@ def edge_jacobians(poses: Array, edges: Edges) -> tuple[Array, Array]:
 
 
 def optimize_graph(poses: Array, edges: Edges) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on all poses but node 0, which holds still and must be connected with every other.
+    """Levenberg-Marquardt on all poses but node 0, which holds still and must be connected with
+    every other.
 
-    poses: [n, 4, 4] T_cw. The Cauchy kernel of the robust edges begins so wide that each has at least half its weight
-    and narrows to 3 sigmas, so that a right loop pulls from the start and a wrong one lets go.
-    Returns the poses and [e] the weight 0..1 each edge ended with.
+    poses: [n, 4, 4] T_cw. The Cauchy kernel of the robust edges begins so wide that each has at
+    least half its weight and narrows to 3 sigmas, so that a right loop pulls from the start and a
+    wrong one lets go. Returns the poses and [e] the weight 0..1 each edge ended with.
     """
     width = _squared(poses, edges)[edges.robust].max(initial=_WIDTH**2)
     for width2 in np.geomspace(width, _WIDTH**2, _ROUNDS):
@@ -104,7 +118,8 @@ def _solve(poses: Array, edges: Edges, weights: Array, damping: float) -> Array:
     blocks = [jacobian * root[..., None] for jacobian in edge_jacobians(poses, edges)]
     rows = np.repeat(np.arange(e * 6), 6).reshape(e, 6, 6)
     columns = [
-        np.broadcast_to(node[:, None, None] * 6 + np.arange(6), (e, 6, 6)) for node in (edges.first, edges.second)
+        np.broadcast_to(node[:, None, None] * 6 + np.arange(6), (e, 6, 6))
+        for node in (edges.first, edges.second)
     ]
     values = np.concatenate([block.ravel() for block in blocks])
     places = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))

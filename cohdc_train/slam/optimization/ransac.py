@@ -1,4 +1,6 @@
-"""A pose from matches of which many may be wrong: random triples of 3D-3D matches, judged by reprojection."""
+"""A pose from matches of which many may be wrong: random triples of 3D-3D matches, judged by
+reprojection.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,9 @@ _DEPTH_TOLERANCE = 0.1  # of the depth: a match whose measured depth is further 
 
 
 def rigid_transforms(source: Array, target: Array) -> Array:
-    """source, target: [h, k, 3] corresponding points, m. Returns [h, 4, 4] with target ~ T source (Kabsch)."""
+    """source, target: [h, k, 3] corresponding points, m. Returns [h, 4, 4] with target ~ T source
+    (Kabsch).
+    """
     from_mean, to_mean = source.mean(axis=1), target.mean(axis=1)
     covariance = (target - to_mean[:, None]).transpose(0, 2, 1) @ (source - from_mean[:, None])
     U, _, Vt = np.linalg.svd(covariance)
@@ -36,9 +40,9 @@ def ransac_pose(
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """The pose most matches agree with.
 
-    points: [m, 3] world, m; seen: what the camera measured of them; guess: [4, 4] T_cw that competes with
-    the random hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer than three matches that have depth
-    and no guess.
+    points: [m, 3] world, m; seen: what the camera measured of them; guess: [4, 4] T_cw that
+    competes with the random hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer
+    than three matches that have depth and no guess.
     """
     poses = [] if guess is None else [guess[None]]
     with_depth = np.flatnonzero(~np.isnan(seen.depths))
@@ -55,7 +59,9 @@ def ransac_pose(
     return candidates[best], agree[best]
 
 
-def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera) -> NDArray[np.bool_]:
+def _agreement(
+    poses: Array, points: Array, seen: Observations, camera: Camera
+) -> NDArray[np.bool_]:
     """[h, m] whether a match agrees with a hypothesis, in pixels and, where measured, in depth."""
     turned = (poses[:, :3, :3].reshape(-1, 3) @ points.T).reshape(len(poses), 3, -1)
     x, y, depth = (turned + poses[:, :3, 3:]).transpose(1, 0, 2)
@@ -63,5 +69,7 @@ def _agreement(poses: Array, points: Array, seen: Observations, camera: Camera) 
     error_u = camera.fx * x / z + (camera.cx - seen.pixels[:, 0])
     error_v = camera.fy * y / z + (camera.cy - seen.pixels[:, 1])
     agree = error_u**2 + error_v**2 <= (_PIXEL_TOLERANCE * seen.sigmas) ** 2
-    agree &= ~(np.abs(depth - seen.depths) > _DEPTH_TOLERANCE * z)  # a depth of nan disagrees with nothing
+    agree &= ~(
+        np.abs(depth - seen.depths) > _DEPTH_TOLERANCE * z
+    )  # a depth of nan disagrees with nothing
     return np.asarray(agree & (depth > _NEAR))

@@ -16,8 +16,8 @@ MIN_DEPTH_M = 0.05  # m: points nearer than this, or behind the camera, do not c
 
 @dataclass(frozen=True)
 class Observations:
-    """m measurements. pixels: [m, 2] undistorted px; depths: [m] m, nan = none; sigmas, depth_sigmas: [m] px, of each
-    coordinate and of the disparity that depth stands for."""
+    """m measurements. pixels: [m, 2] undistorted px; depths: [m] m, nan = none; sigmas,
+    depth_sigmas: [m] px, of each coordinate and of the disparity that depth stands for."""
 
     pixels: Array
     depths: Array
@@ -26,7 +26,9 @@ class Observations:
 
     def __post_init__(self) -> None:
         m = len(self.pixels)
-        shapes = tuple(array.shape for array in (self.pixels, self.depths, self.sigmas, self.depth_sigmas))
+        shapes = tuple(
+            array.shape for array in (self.pixels, self.depths, self.sigmas, self.depth_sigmas)
+        )
         if shapes != ((m, 2), (m,), (m,), (m,)):
             raise ValueError("observations disagree in shape")
 
@@ -35,12 +37,18 @@ class Observations:
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Observations":
         """The chosen rows."""
-        return Observations(self.pixels[rows], self.depths[rows], self.sigmas[rows], self.depth_sigmas[rows])
+        return Observations(
+            self.pixels[rows], self.depths[rows], self.sigmas[rows], self.depth_sigmas[rows]
+        )
 
     def trusted(self, trust: Array) -> "Observations":
-        """The same of points that stand still with these probabilities, [m] above 0 up to 1: they weigh as much."""
+        """The same of points that stand still with these probabilities, [m] above 0 up to 1: they
+        weigh as much.
+        """
         share = np.sqrt(trust)
-        return Observations(self.pixels, self.depths, self.sigmas / share, self.depth_sigmas / share)
+        return Observations(
+            self.pixels, self.depths, self.sigmas / share, self.depth_sigmas / share
+        )
 
     @property
     def limits(self) -> Array:
@@ -60,7 +68,9 @@ def joined(parts: list[Observations]) -> Observations:
 
 @dataclass(frozen=True)
 class ReprojectionModel:
-    """The camera and bf, px m: how far depth is trusted. 100 px m is a sigma of 1 cm at 1 m and 9 cm at 3 m."""
+    """The camera and bf, px m: how far depth is trusted. 100 px m is a sigma of 1 cm at 1 m and 9
+    cm at 3 m.
+    """
 
     camera: Camera
     bf: float = 100.0
@@ -68,14 +78,17 @@ class ReprojectionModel:
 
 @dataclass(frozen=True)
 class Prior:
-    """A pose as it was expected. T_cw: [4, 4] world to camera, m; information: [6, 6] inverse covariance of the small
-    motion (m, rad) in the camera's frame that leads from it to the true one."""
+    """A pose as it was expected. T_cw: [4, 4] world to camera, m; information: [6, 6] inverse
+    covariance of the small motion (m, rad) in the camera's frame that leads from it to the true
+    one."""
 
     T_cw: Array
     information: Array
 
     def pull(self, T_cw: Array) -> Array:
-        """[6] gradient, at T_cw, of half the squared distance in sigmas; to first order in the rotation between."""
+        """[6] gradient, at T_cw, of half the squared distance in sigmas; to first order in the
+        rotation between.
+        """
         between = T_cw @ inverse(self.T_cw)
         turn = np.asarray(cv2.Rodrigues(between[:3, :3])[0])[:, 0]
         way = between[:3, 3] - 0.5 * np.cross(turn, between[:3, 3])
@@ -83,7 +96,9 @@ class Prior:
 
 
 def residuals(local: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
-    """local: [m, 3] points in the camera frame, m. Returns [m, 3] prediction minus measurement, in sigmas."""
+    """local: [m, 3] points in the camera frame, m. Returns [m, 3] prediction minus measurement, in
+    sigmas.
+    """
     camera = reprojection.camera
     z = np.maximum(local[:, 2], MIN_DEPTH_M)
     result = np.empty((3, len(local))).T  # each residual's values side by side
@@ -112,7 +127,9 @@ def residual_jacobian(local: Array, seen: Observations, reprojection: Reprojecti
 
 
 def pose_jacobian(local: Array, derivative: Array) -> Array:
-    """local: [m, 3]; derivative: [m, 3, 3] d residual / d local. Returns [m, 3, 6], d residual / d xi."""
+    """local: [m, 3]; derivative: [m, 3, 3] d residual / d local. Returns [m, 3, 6], d residual / d
+    xi.
+    """
     x, y, z = (local[:, axis, None] for axis in range(3))
     dx, dy, dz = (derivative[:, :, axis] for axis in range(3))
     result = np.empty((len(local), 3, 6))
@@ -123,7 +140,9 @@ def pose_jacobian(local: Array, derivative: Array) -> Array:
     return result
 
 
-def chi_square(T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
+def chi_square(
+    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel
+) -> Array:
     """[m] squared residual in sigmas; infinite for points that lie behind the camera."""
     local = to_local(T_cw, points)
     chi2 = np.einsum("ij,ij->i", *(2 * (residuals(local, seen, reprojection),)))
@@ -131,12 +150,18 @@ def chi_square(T_cw: Array, points: Array, seen: Observations, reprojection: Rep
 
 
 def huber_weights(chi2: Array, limits: Array) -> Array:
-    """[m] weight of each measurement in iteratively reweighted least squares: 1 inside the limit, falling outside."""
+    """[m] weight of each measurement in iteratively reweighted least squares: 1 inside the limit,
+    falling outside.
+    """
     return np.sqrt(np.minimum(1.0, limits / np.maximum(chi2, 1e-12)))
 
 
-def fill_pose_jacobian(J: Array, local: Array, seen: Observations, reprojection: ReprojectionModel) -> None:
-    """J: [6, 3, m], zero at first: pose_jacobian of residual_jacobian, laid out for speed with its zeros left out."""
+def fill_pose_jacobian(
+    J: Array, local: Array, seen: Observations, reprojection: ReprojectionModel
+) -> None:
+    """J: [6, 3, m], zero at first: pose_jacobian of residual_jacobian, laid out for speed with its
+    zeros left out.
+    """
     camera = reprojection.camera
     x, y = np.ascontiguousarray(local[:, :2].T)
     z = np.maximum(local[:, 2], MIN_DEPTH_M)

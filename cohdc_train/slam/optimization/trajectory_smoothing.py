@@ -1,7 +1,8 @@
-"""A trajectory after the fact: where each frame was by what it saw, what those around it saw, and how a hand moves.
+"""A trajectory after the fact: where each frame was by what it saw, what those around it saw, and
+how a hand moves.
 
-The fixed-interval counterpart of `motion`: velocity changes as there, unless it is seen to change faster, but frames
-that come later count as well. All poses are found at once.
+The fixed-interval counterpart of `motion`: velocity changes as there, unless it is seen to change
+faster, but frames that come later count as well. All poses are found at once.
 """
 
 import numpy as np
@@ -20,9 +21,10 @@ _BAND = 18  # diagonals of the normal equations: three frames hang together
 
 
 def smoothed(stamps: Array, poses: Array, information: Array, pulls: Array) -> Array:
-    """stamps: [n] s, rising; poses: [n, 4, 4] T_cw world to camera, m; information: [n, 6, 6] inverse covariance of
-    each by what it saw, in the camera's frame, (m, rad); pulls: [n, 6] `Prior.pull` of what was expected when the pose
-    was found, 0 where nothing was: it is taken out, for what came before counts here anyway. Returns [n, 4, 4] T_cw.
+    """stamps: [n] s, rising; poses: [n, 4, 4] T_cw world to camera, m; information: [n, 6, 6]
+    inverse covariance of each by what it saw, in the camera's frame, (m, rad); pulls: [n, 6]
+    `Prior.pull` of what was expected when the pose was found, 0 where nothing was: it is taken out,
+    for what came before counts here anyway. Returns [n, 4, 4] T_cw.
 
     Frames further apart than LONGEST have nothing to do with each other.
     """
@@ -51,31 +53,43 @@ def _smoothed_run(stamps: Array, poses: Array, information: Array, pulls: Array)
     for _ in range(_ROUNDS):
         small = _solved(seen, towards, shares, change, weight / deviation**2)
         left = (change + (shares * np.stack(_threes(small))).sum(axis=0)) / deviation
-        weight = 1 / np.maximum(1.0, uniform_filter1d(left**2, 2 * _AROUND + 1, axis=0, mode="nearest"))
+        weight = 1 / np.maximum(
+            1.0, uniform_filter1d(left**2, 2 * _AROUND + 1, axis=0, mode="nearest")
+        )
     return np.asarray(exp_se3(small) @ poses, dtype=np.float64)
 
 
 def _threes(values: Array) -> tuple[Array, Array, Array]:
-    """values: [n, ...] of frames. Those of the frame before, of the frame and of the one after, [n - 2, ...] each."""
+    """values: [n, ...] of frames. Those of the frame before, of the frame and of the one after, [n
+    - 2, ...] each.
+    """
     return values[:-2], values[1:-1], values[2:]
 
 
 def _sharper(seen: Array, shares: Array, change: Array, deviation: Array) -> Array:
-    """[6, 6] how much more frames know than they say: with so much noise velocity would change more than it does."""
+    """[6, 6] how much more frames know than they say: with so much noise velocity would change more
+    than it does.
+    """
     own = np.diagonal(np.linalg.inv(seen), axis1=1, axis2=2)
     foreseen = (shares**2 * np.stack(_threes(own))).sum(axis=0).mean(axis=0)
-    share = np.clip(((change**2).mean(axis=0) - (deviation**2).mean(axis=0)) / foreseen, _LEAST_SHARE, 1.0)
+    share = np.clip(
+        ((change**2).mean(axis=0) - (deviation**2).mean(axis=0)) / foreseen, _LEAST_SHARE, 1.0
+    )
     return np.asarray(1 / np.sqrt(share[:, None] * share[None]))
 
 
 def _solved(seen: Array, towards: Array, shares: Array, change: Array, weight: Array) -> Array:
     """[n, 6] the small motions that reconcile frames with changes of velocity [n - 2, 6].
 
-    seen: [n, 6, 6] information; towards: [n, 6] the same times the small motion to where what a frame saw puts it;
+    seen: [n, 6, 6] information; towards: [n, 6] the same times the small motion to where what a
+    frame saw puts it;
     shares: [3, n - 2, 1] of the motions of three frames in a change; weight: [n - 2, 6].
     """
     n = len(seen)
-    diagonal, right = np.zeros((3, n, 6)), towards.copy()  # by how many frames a block lies below the diagonal
+    diagonal, right = (
+        np.zeros((3, n, 6)),
+        towards.copy(),
+    )  # by how many frames a block lies below the diagonal
     for row in range(3):
         _threes(right)[row][...] -= shares[row] * weight * change
         for column in range(row + 1):

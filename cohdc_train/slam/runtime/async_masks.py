@@ -1,4 +1,6 @@
-"""Masks without waiting for the segmenter: it works beside tracking, and its newest mask is carried to every frame."""
+"""Masks without waiting for the segmenter: it works beside tracking, and its newest mask is carried
+to every frame.
+"""
 
 import os
 import sys
@@ -31,11 +33,13 @@ class _Done:
 class AsyncMasks:
     """A mask for every frame from a segmenter that keeps up with only some.
 
-    outline: view -> mask [H, W], True = dynamic, and by how many px it is to grow. It runs in a thread, on the newest
-    frame whenever it is free; those that come while it is busy are not kept for it, for a fresher one comes soon. Only
-    the first frame waits for its mask. Use inside `with`.
+    outline: view -> mask [H, W], True = dynamic, and by how many px it is to grow. It runs in a
+    thread, on the newest frame whenever it is free; those that come while it is busy are not kept
+    for it, for a fresher one comes soon. Only the first frame waits for its mask. Use inside
+    `with`.
 
-    ages: s, per frame, from the frame its mask was made of; segment_ms: time of each mask in the worker.
+    ages: s, per frame, from the frame its mask was made of; segment_ms: time of each mask in the
+    worker.
     """
 
     def __init__(self, outline: Outline) -> None:
@@ -53,14 +57,19 @@ class AsyncMasks:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._jobs.poll()
         self._jobs.close()
         self._worker.join()
 
     def __call__(self, view: View) -> Mask:
-        """[H, W] bool, True = dynamic. Views must come in the order of time; raises what the segmenter raised."""
+        """[H, W] bool, True = dynamic. Views must come in the order of time; raises what the
+        segmenter raised.
+        """
         job = self._carried.advance(view)
         self._take(self._results.poll())
         if not self._busy:

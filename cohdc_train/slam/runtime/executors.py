@@ -15,7 +15,9 @@ NICE = 15  # a worker gives way to tracking when there are fewer cores than work
 
 @contextmanager
 def worker_process() -> Iterator[Executor]:
-    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to it."""
+    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to
+    it.
+    """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as executor:
         executor.submit(_begin).result()
@@ -23,7 +25,9 @@ def worker_process() -> Iterator[Executor]:
 
 
 def _begin() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the whole group; the parent ends this process
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a terminal sends it to the whole group; the parent ends this process
     import scipy.linalg  # noqa: F401  with numpy's: the limit only reaches libraries that are loaded
 
     threadpool_limits(1, "blas")

@@ -24,7 +24,9 @@ class LatestSlot(Generic[T]):
             self._changed.notify()
 
     def take(self) -> T | None:
-        """Wait for an item. Returns None once the slot is closed and empty; raises the error it was closed with."""
+        """Wait for an item. Returns None once the slot is closed and empty; raises the error it was
+        closed with.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None or self._closed)
             return self._pop()

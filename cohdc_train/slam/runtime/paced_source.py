@@ -1,4 +1,6 @@
-"""Views at the pace of their stamps: whoever is late finds the newest one, and the others are dropped and counted."""
+"""Views at the pace of their stamps: whoever is late finds the newest one, and the others are
+dropped and counted.
+"""
 
 import threading
 import time
@@ -40,13 +42,14 @@ class WallClock:
 class PacedSource:
     """A source whose views come when they are due. Iterate once, inside `with`.
 
-    The first view starts the clock when it has been dealt with: until then nothing is known of the place, and masks
-    are waited for. From then on a thread makes the views and hands each over at its stamp; a camera's, of which nobody
-    knows how many will come, at once.
+    The first view starts the clock when it has been dealt with: until then nothing is known of the
+    place, and masks are waited for. From then on a thread makes the views and hands each over at
+    its stamp; a camera's, of which nobody knows how many will come, at once.
 
-    `dropped` counts the views that a newer one replaced before they were asked for. `latencies`, s: from when a view
-    was due until `answered`, or else until the next was asked for, without the first. `behind`, s: what playing took
-    longer than the recording, because images could not be read as fast; then all later ones are due so much later.
+    `dropped` counts the views that a newer one replaced before they were asked for. `latencies`, s:
+    from when a view was due until `answered`, or else until the next was asked for, without the
+    first. `behind`, s: what playing took longer than the recording, because images could not be
+    read as fast; then all later ones are due so much later.
     """
 
     def __init__(self, source: Source, clock: Clock | None = None) -> None:
@@ -70,7 +73,9 @@ class PacedSource:
         return self._slot.dropped
 
     def spent(self) -> float:
-        """Share of the time between views that has gone since the latest was due; work beyond 1 holds up the next."""
+        """Share of the time between views that has gone since the latest was due; work beyond 1
+        holds up the next.
+        """
         return (self._clock.now() - self._due) / max(self._between, 1e-6)
 
     def answered(self) -> None:
@@ -86,7 +91,10 @@ class PacedSource:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._stop.set()
         if self._reader is not None:
@@ -99,7 +107,9 @@ class PacedSource:
             return
         yield first
         start = self._clock.now() - first.t  # the moment at which stamps were 0
-        self._reader = threading.Thread(target=self._read, args=(views, start), name="reader", daemon=True)
+        self._reader = threading.Thread(
+            target=self._read, args=(views, start), name="reader", daemon=True
+        )
         self._reader.start()
         while (item := self._slot.take()) is not None:
             view, self._due = item

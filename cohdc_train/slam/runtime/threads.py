@@ -1,5 +1,5 @@
-"""OpenCV and linear algebra on one thread: the order of their sums cannot change from run to run or with the number of
-cores, and no thread of theirs spins where the segmenter works."""
+"""OpenCV and linear algebra on one thread: the order of their sums cannot change from run to run or
+with the number of cores, and no thread of theirs spins where the segmenter works."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 def one_thread() -> Iterator[None]:
     """For a `with` block; with a fixed seed of OpenCV's random numbers.
 
-    Both are the whole process's: of two blocks at once the one that ends first takes the other's limit with it.
+    Both are the whole process's: of two blocks at once the one that ends first takes the other's
+    limit with it.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -1,4 +1,6 @@
-"""What runs beside tracking in real time: the source at its own pace, the segmenter, local bundle adjustment."""
+"""What runs beside tracking in real time: the source at its own pace, the segmenter, local bundle
+adjustment.
+"""
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -41,9 +43,9 @@ class Workers:
         return answered
 
     def metrics(self) -> dict[str, Any]:
-        """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until its pose was known), of
-        the masks' `age`, and of the `segmenter`, for which nobody waited; how many frames were `dropped`; by how many
-        seconds playing fell `behind` the recording."""
+        """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until its pose
+        was known), of the masks' `age`, and of the `segmenter`, for which nobody waited; how many
+        frames were `dropped`; by how many seconds playing fell `behind` the recording."""
         result: dict[str, Any] = {
             "dropped": self.source.dropped,
             "behind_s": self.source.behind,

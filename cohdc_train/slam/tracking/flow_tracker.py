@@ -1,9 +1,10 @@
-"""A frame's pose at once, before it is matched against the map or without: optical flow finds the points that the last
-matched one saw.
+"""A frame's pose at once, before it is matched against the map or without: optical flow finds the
+points that the last matched one saw.
 
-Corners, descriptors and the search for both take most of a frame's time. A thirtieth of a second later the same points
-are a few pixels on, and the patch around each says where. Flow starts from the matched frame every time, never from a
-frame that was itself tracked by it, so that nothing adds up.
+Corners, descriptors and the search for both take most of a frame's time. A thirtieth of a second
+later the same points are a few pixels on, and the patch around each says where. Flow starts from
+the matched frame every time, never from a frame that was itself tracked by it, so that nothing adds
+up.
 """
 
 from dataclasses import dataclass, replace
@@ -41,9 +42,9 @@ _NEAR = 0.05  # m
 class _Start:
     """A matched frame.
 
-    gray: [H, W] uint8; ids: [m] int64 points that are matched; corners: where, m of them; off: [m, 2] px by which each
-    lies beside its point's projection; masked: [m] bool, it was matched though a mask was given for it; reference: the
-    keyframe that sees most of the points.
+    gray: [H, W] uint8; ids: [m] int64 points that are matched; corners: where, m of them; off: [m,
+    2] px by which each lies beside its point's projection; masked: [m] bool, it was matched though
+    a mask was given for it; reference: the keyframe that sees most of the points.
     """
 
     gray: NDArray[np.uint8]
@@ -56,7 +57,9 @@ class _Start:
     def take(self, rows: NDArray[np.int64]) -> "_Start":
         """The same with the chosen points."""
         ids, keypoints = self.ids[rows], self.keypoints.take(rows)
-        return replace(self, ids=ids, keypoints=keypoints, off=self.off[rows], masked=self.masked[rows])
+        return replace(
+            self, ids=ids, keypoints=keypoints, off=self.off[rows], masked=self.masked[rows]
+        )
 
 
 @dataclass(frozen=True)
@@ -78,12 +81,16 @@ class FlowTracker:
         self._set_out = self._agree = 0  # points
 
     def begin(
-        self, rgb: NDArray[np.uint8], features: Features, fit: Fit | None, mask: NDArray[np.bool_] | None
+        self,
+        rgb: NDArray[np.uint8],
+        features: Features,
+        fit: Fit | None,
+        mask: NDArray[np.bool_] | None,
     ) -> None:
         """A frame has been matched: what it sees is followed from now on.
 
-        fit: None when the place is lost; mask: [H, W] bool, as it was given. What has been matched under it all the
-        same, because it is at rest, may be followed there.
+        fit: None when the place is lost; mask: [H, W] bool, as it was given. What has been matched
+        under it all the same, because it is at rest, may be followed there.
         """
         self._start, self._followed = None, 0
         if fit is None or len(fit.matches) < _LEAST:
@@ -92,12 +99,17 @@ class FlowTracker:
         keypoints = features.keypoints(rows)
         off = keypoints.pixels - self._seen_from(fit.T_cw, fit.matches.points)
         masked = _covered(keypoints.pixels, mask)
-        self._start = _Start(gray_of(rgb), fit.matches.points, keypoints, off, masked, fit.reference)
+        self._start = _Start(
+            gray_of(rgb), fit.matches.points, keypoints, off, masked, fit.reference
+        )
 
-    def follow(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array) -> Followed | None:
+    def follow(
+        self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array
+    ) -> Followed | None:
         """Look for the points in the next frame; None when there is nothing to look for.
 
-        rgb: [H, W, 3]; mask: [H, W] bool, True = dynamic: nothing is followed to there; T_cw: [4, 4] expected pose.
+        rgb: [H, W, 3]; mask: [H, W] bool, True = dynamic: nothing is followed to there; T_cw: [4,
+        4] expected pose.
         """
         if self._start is None:
             return None
@@ -118,7 +130,9 @@ class FlowTracker:
         ids, first = np.unique(self.map.current(known), return_index=True)
         rows, same = rows[first], ids == known[first]
         keypoints = before.keypoints.take(rows)
-        return Followed(ids, replace(keypoints, pixels=pixels[rows], is_subpixel=keypoints.is_subpixel & same))
+        return Followed(
+            ids, replace(keypoints, pixels=pixels[rows], is_subpixel=keypoints.is_subpixel & same)
+        )
 
     def locate(self, followed: Followed, features: Features, expected: Prediction) -> Fit | None:
         """The pose on which enough of the points agree. features: of the followed corners."""
@@ -129,7 +143,9 @@ class FlowTracker:
         matches = Matches(followed.ids, np.arange(len(features)))
         points, seen = self.map.measured(matches, features)
         prior = expected.given(len(features))
-        T_cw, inlier = optimize_pose(expected.prior.T_cw, points, seen, self._reprojection, prior=prior)
+        T_cw, inlier = optimize_pose(
+            expected.prior.T_cw, points, seen, self._reprojection, prior=prior
+        )
         self._agree = int(inlier.sum())
         if self._agree < least:
             return None
@@ -138,13 +154,16 @@ class FlowTracker:
 
     @property
     def left(self) -> float:
-        """Share of the points that set out on which the latest answer stands: a view that changes loses them."""
+        """Share of the points that set out on which the latest answer stands: a view that changes
+        loses them.
+        """
         return self._agree / self._set_out
 
     def over(self, hurry: bool, busy: bool = False) -> bool:
         """Whether the frame that was followed to is to be matched, and be begun from.
 
-        hurry: it may wait; busy: it would not become a keyframe, so that it may wait unless much has changed.
+        hurry: it may wait; busy: it would not become a keyframe, so that it may wait unless much
+        has changed.
         """
         if hurry:
             return self._followed > _AT_MOST

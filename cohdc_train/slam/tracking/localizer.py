@@ -1,4 +1,6 @@
-"""The pose of one frame against the map: from the last pose, or from nothing when the place was lost."""
+"""The pose of one frame against the map: from the last pose, or from nothing when the place was
+lost.
+"""
 
 from dataclasses import dataclass, field
 
@@ -27,10 +29,11 @@ _CANDIDATES = 6  # keyframes tried per lost frame
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference: the keyframe that
-    sees most of them, None while the pose is a rough one; prior: what was expected, where that counted as well;
-    information: [6, 6] inverse covariance of the pose by what is seen alone, in the camera's frame, 0 until the pose is
-    settled."""
+    """Where a frame is. T_cw: [4, 4] world to camera, m; matches: the points it sees; reference:
+    the keyframe that sees most of them, None while the pose is a rough one; prior: what was
+    expected, where that counted as well;
+    information: [6, 6] inverse covariance of the pose by what is seen alone, in the camera's frame,
+    0 until the pose is settled."""
 
     T_cw: Array
     matches: Matches
@@ -45,12 +48,15 @@ class Fit:
 
 
 class Localizer:
-    """Finds frames in a map, in two steps: which points a frame sees (`near`, `anywhere`), and where it is (`settle`).
+    """Finds frames in a map, in two steps: which points a frame sees (`near`, `anywhere`), and
+    where it is (`settle`).
 
     judges: groups of points that move against the rest are left out and lose weight.
     """
 
-    def __init__(self, world: Map, reprojection: ReprojectionModel, seed: int, judges: bool) -> None:
+    def __init__(
+        self, world: Map, reprojection: ReprojectionModel, seed: int, judges: bool
+    ) -> None:
         self.map = world
         self._reprojection = reprojection
         self._judges = judges
@@ -66,8 +72,8 @@ class Localizer:
     ) -> Fit | None:
         """The frame after `last`. Where it sees little, what was expected counts as well.
 
-        flown: where flow says it is. There, or where a camera that moves calmly is expected, it is to a few px: the map
-        is asked at once. Where it does not answer, a rough pose comes first.
+        flown: where flow says it is. There, or where a camera that moves calmly is expected, it is
+        to a few px: the map is asked at once. Where it does not answer, a rough pose comes first.
         """
         if expected.calm or flown is not None:
             there = Fit(expected.prior.T_cw, last.matches) if flown is None else flown
@@ -89,13 +95,19 @@ class Localizer:
             ids = self.map.keyframes[index].seen_points()
             matches = match_descriptors(ids, self.map.descriptors[ids], features)
             rough = self._solve(features, matches, None, hypotheses=256)
-            fit = None if rough is None else self._against_local_map(features, rough, _MIN_FOUND_AGAIN)
+            fit = (
+                None
+                if rough is None
+                else self._against_local_map(features, rough, _MIN_FOUND_AGAIN)
+            )
             if fit is not None:
                 return fit
         return None
 
     def _follow(self, features: Features, last: Fit, expected: Prediction) -> Fit | None:
-        """A rough pose from the points of the last frame, first near where the velocity puts them, then further off."""
+        """A rough pose from the points of the last frame, first near where the velocity puts them,
+        then further off.
+        """
         for guess, radius in ((expected.prior.T_cw, 15.0), (last.T_cw, 40.0)):
             projected = self.map.project(last.matches.points, guess)
             matches = match_projected(projected, features, radius)
@@ -104,7 +116,9 @@ class Localizer:
                 return fit
         return None
 
-    def _solve(self, features: Features, matches: Matches, guess: Array | None, hypotheses: int) -> Fit | None:
+    def _solve(
+        self, features: Features, matches: Matches, guess: Array | None, hypotheses: int
+    ) -> Fit | None:
         if len(matches) < _MIN_FIRST:
             return None
         points, seen = self.map.measured(matches, features)
@@ -113,7 +127,9 @@ class Localizer:
             return None
         T_cw, agree = found
         matches = matches.take(agree)
-        T_cw, inlier = optimize_pose(T_cw, points[agree], seen.take(agree), self._reprojection, rounds=1)
+        T_cw, inlier = optimize_pose(
+            T_cw, points[agree], seen.take(agree), self._reprojection, rounds=1
+        )
         return Fit(T_cw, matches.take(inlier)) if inlier.sum() >= _MIN_FIRST else None
 
     def _against_local_map(
@@ -137,19 +153,23 @@ class Localizer:
         return Fit(T_cw, matches, reference[0], prior)
 
     def settle(self, features: Features, fit: Fit) -> Fit | None:
-        """The final pose of a frame that was found, by corners that may have been moved since. None where hardly
-        anything fits.
+        """The final pose of a frame that was found, by corners that may have been moved since. None
+        where hardly anything fits.
 
-        What does not fit stays matched, unless it moves. What was expected counts if it did when the frame was found:
-        a place found anew speaks against it.
+        What does not fit stays matched, unless it moves. What was expected counts if it did when
+        the frame was found: a place found anew speaks against it.
         """
         ids = fit.matches.points
         points, seen = self.map.measured(fit.matches, features)
         if self._judges:
             known = self.map.found[ids]
-            T_cw, inlier, moving = pose_of_rest(fit.T_cw, points, seen, self._reprojection, known, fit.prior)
+            T_cw, inlier, moving = pose_of_rest(
+                fit.T_cw, points, seen, self._reprojection, known, fit.prior
+            )
         else:
-            T_cw, inlier = optimize_pose(fit.T_cw, points, seen, self._reprojection, prior=fit.prior)
+            T_cw, inlier = optimize_pose(
+                fit.T_cw, points, seen, self._reprojection, prior=fit.prior
+            )
             moving = np.zeros(len(ids), dtype=np.bool_)
         if inlier.sum() < _MIN_TRACKED:
             return None

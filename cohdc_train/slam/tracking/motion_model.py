@@ -1,7 +1,9 @@
-"""How the camera moves: a Kalman filter of constant velocity. It says where the next frame should be, and how surely.
+"""How the camera moves: a Kalman filter of constant velocity. It says where the next frame should
+be, and how surely.
 
-A hand speeds up by .2 to .6 m/s^2 and 2 to 6 rad/s^2 per axis (RMS at 30 frames/s of TUM's seven motion-captured
-sequences), so that what a frame sees decides where it is, but one that sees only a corner of the room cannot leap.
+A hand speeds up by .2 to .6 m/s^2 and 2 to 6 rad/s^2 per axis (RMS at 30 frames/s of TUM's seven
+motion-captured sequences), so that what a frame sees decides where it is, but one that sees only a
+corner of the room cannot leap.
 """
 
 from dataclasses import dataclass
@@ -28,12 +30,15 @@ class Prediction:
     calm: bool
 
     def given(self, points: int) -> Prior | None:
-        """What counts beside so many points that a frame sees: nothing where they suffice, or the camera is shaken."""
+        """What counts beside so many points that a frame sees: nothing where they suffice, or the
+        camera is shaken.
+        """
         return self.prior if self.calm and points < FEW else None
 
 
 class MotionModel:
-    """Pose and velocity of the latest frame with their joint covariance [12, 12], of (m, rad, m/s, rad/s).
+    """Pose and velocity of the latest frame with their joint covariance [12, 12], of (m, rad, m/s,
+    rad/s).
 
     Errors are those of a small motion in the camera's frame: T_true = exp(error) T.
     """
@@ -56,20 +61,25 @@ class MotionModel:
 
     @property
     def twist(self) -> Array | None:
-        """[6] velocity, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t). None while it is not known."""
+        """[6] velocity, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t). None while it is not
+        known.
+        """
         return self._velocity if self._t is not None and 0 < self._step <= LONGEST else None
 
     def expected(self, t: float) -> Prediction:
         """Where the camera is at t, s, later than the latest frame.
 
-        After a pause it is held to have gone on for as long as its velocity is known to say something.
+        After a pause it is held to have gone on for as long as its velocity is known to say
+        something.
         """
         return Prediction(self._prior(t, self._predicted(t)), self._unrest < 1)
 
     def found(self, t: float, T_cw: Array, information: Array, pull: Array = _NOTHING) -> None:
-        """The frame at t is at T_cw. information: [6, 6] of what it saw; pull: [6] `Prior.pull` of what was expected,
-        where T_cw is a compromise with that."""
-        seen = np.asarray(np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(_EXACT**2), dtype=np.float64)
+        """The frame at t is at T_cw. information: [6, 6] of what it saw; pull: [6] `Prior.pull` of
+        what was expected, where T_cw is a compromise with that."""
+        seen = np.asarray(
+            np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(_EXACT**2), dtype=np.float64
+        )
         if self._t is None:
             self._begin(T_cw, seen)
             self._unrest = 0.0
@@ -78,7 +88,9 @@ class MotionModel:
         self._t = t
 
     def _begin(self, T_cw: Array, seen: Array, velocity: Array | None = None) -> None:
-        """At a pose, known by the covariance [6, 6] of what was seen, with a velocity of which little is known."""
+        """At a pose, known by the covariance [6, 6] of what was seen, with a velocity of which
+        little is known.
+        """
         self._T_cw = T_cw
         if velocity is None:
             self._step = 0.0

@@ -1,4 +1,6 @@
-"""The tracker: every frame's pose against the map; decides on keyframes; finds the place again after a loss."""
+"""The tracker: every frame's pose against the map; decides on keyframes; finds the place again
+after a loss.
+"""
 
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -49,7 +51,9 @@ _Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class _Frame:
-    """What `Tracker.track` was given. late: s by which depth was taken after colour, None where nobody says."""
+    """What `Tracker.track` was given. late: s by which depth was taken after colour, None where
+    nobody says.
+    """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -61,9 +65,10 @@ class _Frame:
 class Tracker:
     """RGB-D SLAM, one frame at a time; the same frames and seed give the same poses, bit for bit.
 
-    With an executor bundle adjustment runs there, beside tracking (`background_mapping`); poses then depend on time.
-    spent: asked when a frame's pose is known, which share of the time until the next frame has gone; what would hold
-    that one up is put off.
+    With an executor bundle adjustment runs there, beside tracking (`background_mapping`); poses
+    then depend on time.
+    spent: asked when a frame's pose is known, which share of the time until the next frame has
+    gone; what would hold that one up is put off.
     """
 
     def __init__(
@@ -80,20 +85,34 @@ class Tracker:
         self.map = Map(camera)
         self.budget = features
         self.features: Features | None = None  # of the latest frame
-        self.mask: NDArray[np.bool_] | None = None  # as given; a matched frame's less what is at rest, and what moves
+        self.mask: NDArray[np.bool_] | None = (
+            None  # as given; a matched frame's less what is at rest, and what moves
+        )
         self._extract = OrbExtractor(camera, features)
         self._geometry = FreeSpaceChecker(camera)
         self._dynamic_mask = DynamicMaskEstimator(self._geometry)
         self._refiner = PatchRefiner(self.map) if self.method.refinement else None
         self._reprojection = (
-            ReprojectionModel(camera, camera.fx * camera.baseline) if camera.baseline else ReprojectionModel(camera)
+            ReprojectionModel(camera, camera.fx * camera.baseline)
+            if camera.baseline
+            else ReprojectionModel(camera)
         )
         self._localizer = Localizer(self.map, self._reprojection, seed, self.method.static_weights)
-        self._flow = FlowTracker(self.map, self._reprojection) if executor is not None and self.method.flow else None
+        self._flow = (
+            FlowTracker(self.map, self._reprojection)
+            if executor is not None and self.method.flow
+            else None
+        )
         in_parts = self._flow is not None
         loop_closer = LoopCloser(self.map, self._reprojection, seed) if self.method.loops else None
         self._mapping = LocalMapper(
-            self.map, self._reprojection, self.method, self._refiner, loop_closer, executor, in_parts
+            self.map,
+            self._reprojection,
+            self.method,
+            self._refiner,
+            loop_closer,
+            executor,
+            in_parts,
         )
         self._spent = spent
         self._motion = MotionModel()
@@ -115,18 +134,25 @@ class Tracker:
     ) -> Pose:
         """Find the camera of the next frame.
 
-        rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, 0 = no reading; t: s, rising;
-        mask: [H, W] bool, True = dynamic: nothing is taken from there into the map. Where what is left does not carry
-        a pose, the whole picture is matched against the map, whose points stand still; such a frame is no keyframe.
-        depth_t: s, when depth was taken, where that differs from t. on_pose: called as soon as there is an answer,
-        before the work that the frame makes for those to come; what is returned may be more exact.
+        rgb: [H, W, 3] uint8 RGB; depth_m: [H, W] m along the optical axis, 0 = no reading; t: s,
+        rising;
+        mask: [H, W] bool, True = dynamic: nothing is taken from there into the map. Where what is
+        left does not carry a pose, the whole picture is matched against the map, whose points stand
+        still; such a frame is no keyframe.
+        depth_t: s, when depth was taken, where that differs from t. on_pose: called as soon as
+        there is an answer, before the work that the frame makes for those to come; what is returned
+        may be more exact.
         """
         self._check_input(rgb, depth_m, t, mask)
         answer = PoseReporter(t, on_pose)
         self._let(self._mapping.collect)
         frame = _Frame(rgb, depth_m, t, mask, None if depth_t is None else depth_t - t)
         expected = None if self._last is None else self._motion.expected(t)
-        flown = None if self._flow is None or expected is None else self._by_flow(self._flow, frame, expected)
+        flown = (
+            None
+            if self._flow is None or expected is None
+            else self._by_flow(self._flow, frame, expected)
+        )
         if flown is not None:
             answer.give(flown)
             spent = self._spent()
@@ -159,22 +185,38 @@ class Tracker:
         return answer.pose(fit, keyframe)
 
     def _check_input(
-        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], t: float, mask: NDArray[np.bool_] | None
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        t: float,
+        mask: NDArray[np.bool_] | None,
     ) -> None:
-        """Raise DataError where a frame has another shape or type than the camera's, or its time does not rise."""
+        """Raise DataError where a frame has another shape or type than the camera's, or its time
+        does not rise.
+        """
         size = (self.camera.height, self.camera.width)
         if rgb.shape != (*size, 3) or rgb.dtype != np.uint8:
-            raise DataError(f"frame at {t:.6f} s: rgb is {rgb.dtype} {rgb.shape}, not uint8 {(*size, 3)}")
+            raise DataError(
+                f"frame at {t:.6f} s: rgb is {rgb.dtype} {rgb.shape}, not uint8 {(*size, 3)}"
+            )
         if depth_m.shape != size or not np.issubdtype(depth_m.dtype, np.floating):
-            raise DataError(f"frame at {t:.6f} s: depth is {depth_m.dtype} {depth_m.shape}, not float {size} in m")
+            raise DataError(
+                f"frame at {t:.6f} s: depth is {depth_m.dtype} {depth_m.shape}, not float {size} in m"
+            )
         if mask is not None and (mask.shape != size or mask.dtype != np.bool_):
-            raise DataError(f"frame at {t:.6f} s: mask is {mask.dtype} {mask.shape}, not bool {size}")
+            raise DataError(
+                f"frame at {t:.6f} s: mask is {mask.dtype} {mask.shape}, not bool {size}"
+            )
         if self._latest_t is not None and t <= self._latest_t:
-            raise DataError(f"frame at {t:.6f} s: not after the frame before it, at {self._latest_t:.6f} s")
+            raise DataError(
+                f"frame at {t:.6f} s: not after the frame before it, at {self._latest_t:.6f} s"
+            )
         self._latest_t = t
 
     def finish(self) -> None:
-        """Wait for mapping that runs beside tracking, and adjust the whole map; the trajectory is better for it."""
+        """Wait for mapping that runs beside tracking, and adjust the whole map; the trajectory is
+        better for it.
+        """
         self._mapping.finish()
         if self.method.global_adjustment and len(self.map.keyframes) > 1:
             self._seen.adjust(self.map, self._reprojection, self._log)
@@ -185,8 +227,8 @@ class Tracker:
         return self._mapping.loops
 
     def trajectory(self) -> tuple[Array, Array]:
-        """All tracked frames, each re-derived from its reference keyframe, or that one's heir, as the map has it now,
-        and smoothed.
+        """All tracked frames, each re-derived from its reference keyframe, or that one's heir, as
+        the map has it now, and smoothed.
 
         Returns stamps [n] s and poses [n, 4, 4] T_wc camera to world, m.
         """
@@ -204,9 +246,11 @@ class Tracker:
         self.features, self.mask = features, frame.mask
         return fit
 
-    def _by_map(self, frame: _Frame, expected: Prediction | None, flown: Fit | None) -> tuple[Fit | None, bool]:
-        """The pose against the map, or the one by flow where that does not answer; and whether the frame may become a
-        keyframe."""
+    def _by_map(
+        self, frame: _Frame, expected: Prediction | None, flown: Fit | None
+    ) -> tuple[Fit | None, bool]:
+        """The pose against the map, or the one by flow where that does not answer; and whether the
+        frame may become a keyframe."""
         mask = self._dynamic(frame, expected)
         if self._refiner is not None:
             self._refiner.look_at(gray_of(frame.rgb))
@@ -222,21 +266,33 @@ class Tracker:
     def _matched(
         self, frame: _Frame, mask: _Mask | None, expected: Prediction | None, flown: Fit | None
     ) -> tuple[Features, Fit | None]:
-        """The corners of a frame and its pose against the map: by where patches put them, else by where they lie."""
+        """The corners of a frame and its pose against the map: by where patches put them, else by
+        where they lie.
+        """
         features = self._measured(self._extract.find(frame.rgb, mask), frame, mask)
         fit = self._locate(features, frame.rgb, expected, flown)
         if fit is None or fit.reference is None:
             return features, fit
-        refined = features if self._refiner is None else self._refiner.refine(features, fit.matches, fit.T_cw)
+        refined = (
+            features
+            if self._refiner is None
+            else self._refiner.refine(features, fit.matches, fit.T_cw)
+        )
         settled = self._localizer.settle(refined, fit)
-        return (features, self._localizer.settle(features, fit)) if settled is None else (refined, settled)
+        return (
+            (features, self._localizer.settle(features, fit))
+            if settled is None
+            else (refined, settled)
+        )
 
     def _dynamic(self, frame: _Frame, expected: Prediction | None) -> _Mask | None:
         """The mask after depth had its say, where the camera is expected."""
         if not self.method.geometry or self._last is None or expected is None:
             return frame.mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return self._dynamic_mask.of(frame.mask, frame.depth_m, expected.prior.T_cw, around, frame.t)
+        return self._dynamic_mask.of(
+            frame.mask, frame.depth_m, expected.prior.T_cw, around, frame.t
+        )
 
     def _measured(self, keypoints: Keypoints, frame: _Frame, mask: _Mask | None) -> Features:
         """The corners of a frame, all put at its one time."""
@@ -246,12 +302,18 @@ class Tracker:
         return features if twist is None else undo_rolling_shutter(features, self.camera, twist)
 
     def _locate(
-        self, features: Features, rgb: NDArray[np.uint8], expected: Prediction | None, flown: Fit | None
+        self,
+        features: Features,
+        rgb: NDArray[np.uint8],
+        expected: Prediction | None,
+        flown: Fit | None,
     ) -> Fit | None:
         if not self.map.keyframes:
             usable = np.count_nonzero(~np.isnan(features.depths))
             empty = np.zeros(0, dtype=np.int64)
-            where_the_world_begins = Fit(np.eye(4), Matches(empty, empty), information=_CERTAIN * np.eye(6))
+            where_the_world_begins = Fit(
+                np.eye(4), Matches(empty, empty), information=_CERTAIN * np.eye(6)
+            )
             return where_the_world_begins if usable >= MIN_START else None
         if self._last is None or expected is None:
             return self._localizer.anywhere(features, rgb)
@@ -291,7 +353,9 @@ class Tracker:
         point_ids[fit.matches.keypoints] = fit.matches.points
         pictures = thumbnail(frame.rgb), self._geometry.nearest(frame.depth_m)
         keyframe = Keyframe(self.map.joined, frame.t, fit.T_cw, features, point_ids, *pictures)
-        self._mapping.insert(keyframe, lambda: make_depth_image(frame.rgb, frame.depth_m, mask, self.camera))
+        self._mapping.insert(
+            keyframe, lambda: make_depth_image(frame.rgb, frame.depth_m, mask, self.camera)
+        )
         self._motion.carry(inverse(fit.T_cw) @ keyframe.T_cw)
         self._since_keyframe = 0
         self._reference_inliers = 0.0
@@ -307,13 +371,17 @@ class Tracker:
             return
         self._last = fit
         self._since_keyframe += 1
-        row = self._log.append(frame.t, fit.T_cw, fit.reference, fit.information, fit.pull, self.map)
+        row = self._log.append(
+            frame.t, fit.T_cw, fit.reference, fit.information, fit.pull, self.map
+        )
         chosen = self._seen.chosen(fit.matches, matched) if self.method.every_frame else None
         if chosen is None:
             return
         assert self.features is not None
         features = self.features
-        if self._refiner is not None and not matched and not hurry:  # flow says only where the corner was matched to
+        if (
+            self._refiner is not None and not matched and not hurry
+        ):  # flow says only where the corner was matched to
             self._refiner.look_at(gray_of(frame.rgb))
             features = self._refiner.refine(features, chosen, fit.T_cw)
         self._seen.append(row, chosen, features, self.map)

@@ -1,4 +1,6 @@
-"""The dense coloured cloud of what stands still: the keyframes' depth, joined by the poses the run ends with."""
+"""The dense coloured cloud of what stands still: the keyframes' depth, joined by the poses the run
+ends with.
+"""
 
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -18,16 +20,22 @@ from cohdc_train.slam.visualization.point_cloud import Cloud
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 _EDGE = 0.04  # of the depth: a larger step within two pixels is an edge, where near and far mix
-_MASK_BAND = 0.01  # of the image's width by which a mask grows once more: depth images smear outlines
+_MASK_BAND = (
+    0.01  # of the image's width by which a mask grows once more: depth images smear outlines
+)
 _UNITS = 50_000.0  # per camera.far, in the file of kept depth images, which hold 1.3 of it
-_NOISE = 0.03, 0.01  # m, and a Kinect's m / m^2: depth z is held to be within a + b z^2 of the surface it shows
+_NOISE = (
+    0.03,
+    0.01,
+)  # m, and a Kinect's m / m^2: depth z is held to be within a + b z^2 of the surface it shows
 _DOUBT = 2  # a view through a point outweighs so many that show it
 
 Frame = tuple[float, NDArray[np.uint8], NDArray[np.float32]]
 
 
 class KeyframeImages:
-    """Watches a run; keeps colour and unmasked depth of its keyframes in a nameless file on disk, 200 to 600 kB each.
+    """Watches a run; keeps colour and unmasked depth of its keyframes in a nameless file on disk,
+    200 to 600 kB each.
 
     folder: where that file lies until the block it is opened in ends.
     """
@@ -44,7 +52,9 @@ class KeyframeImages:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+    def __call__(
+        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
         """Keep the frame when it became a keyframe."""
         if not record.pose.keyframe:
             return
@@ -59,7 +69,9 @@ class KeyframeImages:
         self._index.append((view.t, len(jpeg), len(png)))
 
     def __iter__(self) -> Iterator[Frame]:
-        """(t s, colour [H, W, 3] RGB, unmasked depth [H, W] m, 0 = none) of every keyframe, without distortion."""
+        """(t s, colour [H, W, 3] RGB, unmasked depth [H, W] m, 0 = none) of every keyframe, without
+        distortion.
+        """
         self._file.seek(0)
         for t, color, depth in self._index:
             jpeg, png = (np.frombuffer(self._file.read(size), np.uint8) for size in (color, depth))
@@ -67,7 +79,8 @@ class KeyframeImages:
             yield (
                 t,
                 bgr[..., ::-1],
-                np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32) / np.float32(self._units),
+                np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.float32)
+                / np.float32(self._units),
             )
 
 
@@ -79,7 +92,9 @@ def unmasked(depth: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDAr
 
 
 def sure(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
-    """[H, W] m, 0 = none: depth without readings beside a depth edge or beyond the sensor's good range."""
+    """[H, W] m, 0 = none: depth without readings beside a depth edge or beyond the sensor's good
+    range.
+    """
     kernel = np.ones((5, 5), dtype=np.uint8)
     step = cv2.dilate(depth, kernel) - _nearest(depth, kernel)
     allowed = _EDGE * depth
@@ -89,19 +104,25 @@ def sure(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
 
 
 def _spread(camera: Camera) -> float:
-    """m / m^2 by which depth errs with its square: a Kinect's, or one px of a stereo pair's disparity."""
+    """m / m^2 by which depth errs with its square: a Kinect's, or one px of a stereo pair's
+    disparity.
+    """
     return 1 / (camera.fx * camera.baseline) if camera.baseline else _NOISE[1]
 
 
 def _nearest(depth: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
     """[H, W] m: the smallest reading around every pixel, infinite where there is none."""
-    return np.asarray(cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), kernel), np.float32)
+    return np.asarray(
+        cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), kernel), np.float32
+    )
 
 
 def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, voxel: float) -> Cloud:
-    """One point per cube of `voxel` m that at least two keyframes saw and that the others do not see through.
+    """One point per cube of `voxel` m that at least two keyframes saw and that the others do not
+    see through.
 
-    images: gone through twice; poses: t -> T_cw [4, 4] of frames, m; images without a pose are left out.
+    images: gone through twice; poses: t -> T_cw [4, 4] of frames, m; images without a pose are left
+    out.
     """
     grid = VoxelGrid(voxel)
     rays = _rays(camera)
@@ -128,8 +149,11 @@ def _rays(camera: Camera) -> Array:
     return camera.backproject(pixels, np.ones(u.size)).reshape(*u.shape, 3)
 
 
-def _evidence(points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Camera) -> NDArray[np.int32]:
-    """[n] what one keyframe says of every point: 1 = there it is, -2 = the view goes through it, 0 = nothing.
+def _evidence(
+    points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Camera
+) -> NDArray[np.int32]:
+    """[n] what one keyframe says of every point: 1 = there it is, -2 = the view goes through it, 0
+    = nothing.
 
     A view goes through when all readings within a pixel lie behind the point.
     """

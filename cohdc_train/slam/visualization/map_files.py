@@ -22,7 +22,9 @@ _VOXEL = 0.01  # m
 
 
 class MapFiles:
-    """Watches a run for what its map's files need beside the map. folder: where they go; cloud: whether cloud.ply."""
+    """Watches a run for what its map's files need beside the map. folder: where they go; cloud:
+    whether cloud.ply.
+    """
 
     def __init__(self, camera: Camera, folder: Path, cloud: bool) -> None:
         self._folder = folder
@@ -36,7 +38,9 @@ class MapFiles:
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+    def __call__(
+        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
         """Note colours of points, and keep the pictures of keyframes for the cloud."""
         self._colors(view, mask, record, tracker)
         if self._images is not None:
@@ -48,7 +52,9 @@ class MapFiles:
         write_ply(self._folder / "map.ply", cloud.points, cloud.colors)
         stamps, poses = tracker.trajectory()
         if self._images is not None:
-            frames = dict(zip(stamps.tolist(), inverse(poses), strict=True))  # with keyframes that left the map
+            frames = dict(
+                zip(stamps.tolist(), inverse(poses), strict=True)
+            )  # with keyframes that left the map
             cloud = fuse(self._images, frames, tracker.camera, _VOXEL)
             write_ply(self._folder / "cloud.ply", cloud.points, cloud.colors)
         if len(poses):

@@ -11,9 +11,16 @@ from cohdc_train.slam.features.keypoints import Features
 _GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
 
 
-def draw_before(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    """All corners an unmasked search finds: red on the mask, green elsewhere. Returns [H, W, 3] RGB."""
-    rows, columns = np.rint(features.pixels[:, 1]).astype(int), np.rint(features.pixels[:, 0]).astype(int)
+def draw_before(
+    rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_] | None
+) -> NDArray[np.uint8]:
+    """All corners an unmasked search finds: red on the mask, green elsewhere. Returns [H, W, 3]
+    RGB.
+    """
+    rows, columns = (
+        np.rint(features.pixels[:, 1]).astype(int),
+        np.rint(features.pixels[:, 0]).astype(int),
+    )
     on_mask = np.zeros(len(features), dtype=np.bool_) if mask is None else mask[rows, columns]
     image = rgb.copy()
     for x, y, red in zip(columns.tolist(), rows.tolist(), on_mask.tolist(), strict=True):
@@ -21,7 +28,9 @@ def draw_before(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.boo
     return image
 
 
-def draw_after(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def draw_after(
+    rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
     """The corners that were kept, and the outline of the mask. Returns [H, W, 3] RGB."""
     image = draw_before(rgb, features, None)
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -31,5 +40,7 @@ def draw_after(rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool
 
 def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
     """Write [H, W, 3] RGB as JPEG."""
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
+    _, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90]
+    )
     path.write_bytes(data.tobytes())

@@ -25,13 +25,19 @@ class Cloud:
 
 
 class PointColors:
-    """Watches a run and keeps the colours of the map's keyframes' corners (some 3 kB each), for the points they are."""
+    """Watches a run and keeps the colours of the map's keyframes' corners (some 3 kB each), for the
+    points they are.
+    """
 
     def __init__(self) -> None:
         self._colors: dict[float, NDArray[np.uint8]] = {}  # t of a keyframe -> [corners, 3] RGB
 
-    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
-        """Note the colours when the frame became a keyframe, and forget those of keyframes that left the map."""
+    def __call__(
+        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
+        """Note the colours when the frame became a keyframe, and forget those of keyframes that
+        left the map.
+        """
         if record.pose.keyframe and tracker.features is not None:
             columns, rows = np.rint(tracker.features.pixels).astype(np.int64).T
             self._colors[view.t] = view.rgb[rows, columns]
@@ -39,7 +45,9 @@ class PointColors:
             self._colors = {t: colors for t, colors in self._colors.items() if t in there}
 
     def cloud(self, world: Map) -> Cloud:
-        """The points that at least three keyframes see (all of them, in a map of fewer), in the last one's colours."""
+        """The points that at least three keyframes see (all of them, in a map of fewer), in the
+        last one's colours.
+        """
         colors = np.zeros((world.size, 3), dtype=np.uint8)
         for keyframe in world.keyframes:
             keypoints = np.flatnonzero(keyframe.point_ids >= 0)

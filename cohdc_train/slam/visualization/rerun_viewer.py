@@ -1,4 +1,6 @@
-"""A run in rerun's viewer, or in a file for it: camera, image with mask, map, way and times. Needs the extra `view`."""
+"""A run in rerun's viewer, or in a file for it: camera, image with mask, map, way and times. Needs
+the extra `view`.
+"""
 
 import os
 import sys
@@ -24,9 +26,11 @@ _WAY = (250, 160, 40)
 
 
 class Viewer:
-    """Watches a run and shows it. window: open rerun's viewer; file: write an .rrd for it, whole when the run is over.
+    """Watches a run and shows it. window: open rerun's viewer; file: write an .rrd for it, whole
+    when the run is over.
 
-    Raises MissingExtraError when rerun-sdk is not installed, CohdcError when its window cannot be opened.
+    Raises MissingExtraError when rerun-sdk is not installed, CohdcError when its window cannot be
+    opened.
     """
 
     def __init__(self, camera: Camera, window: bool, file: Path | None) -> None:
@@ -58,11 +62,17 @@ class Viewer:
             blueprint.TimeSeriesView(origin="inliers", name="inliers"),
             row_shares=[3, 1, 1],
         )
-        layout = blueprint.Horizontal(blueprint.Spatial3DView(origin="world", name="map"), views, column_shares=[3, 2])
-        self._stream.set_sinks(*sinks, default_blueprint=blueprint.Blueprint(layout, collapse_panels=True))
+        layout = blueprint.Horizontal(
+            blueprint.Spatial3DView(origin="world", name="map"), views, column_shares=[3, 2]
+        )
+        self._stream.set_sinks(
+            *sinks, default_blueprint=blueprint.Blueprint(layout, collapse_panels=True)
+        )
 
     def _spawn(self) -> None:
-        """Start the viewer, or find one that runs. pip put it beside Python, which need not be on the PATH."""
+        """Start the viewer, or find one that runs. pip put it beside Python, which need not be on
+        the PATH.
+        """
         before = os.environ.get("PATH", "")
         os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{before}"
         try:
@@ -103,18 +113,28 @@ class Viewer:
         elif self._file is not None:
             self._part().unlink(missing_ok=True)
 
-    def __call__(self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+    def __call__(
+        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
         """Show a frame; the map and the way when it became a keyframe."""
         rerun, log, pose = self._rerun, self._stream.log, record.pose
         self._start = view.t if self._start is None else self._start
         self._stream.set_time("time", duration=view.t - self._start)
         if pose.T_wc is not None:
-            log("world/camera", rerun.Transform3D(translation=pose.T_wc[:3, 3], mat3x3=pose.T_wc[:3, :3]))
+            log(
+                "world/camera",
+                rerun.Transform3D(translation=pose.T_wc[:3, 3], mat3x3=pose.T_wc[:3, :3]),
+            )
         jpeg = cv2.imencode(".jpg", cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
         log("world/camera/image", rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if mask is not None:
             log("world/camera/mask", rerun.SegmentationImage(mask.astype(np.uint8), opacity=0.5))
-        times = {"segment": record.segment_ms, "track": pose.track_ms, "map": pose.map_ms, "depth": record.depth_ms}
+        times = {
+            "segment": record.segment_ms,
+            "track": pose.track_ms,
+            "map": pose.map_ms,
+            "depth": record.depth_ms,
+        }
         for stage, ms in times.items():
             if ms > 0:
                 log(f"ms/{stage}", rerun.Scalars(ms))

@@ -18,15 +18,17 @@ _RED = (230, 40, 40)  # RGB
 def from_above(cloud: Cloud, poses: Sequence[Array]) -> NDArray[np.uint8]:
     """A map as seen from above, the way of the camera in red.
 
-    poses: T_wc [4, 4] m, at least one. Up is where the cameras' upper edges point on average; the first camera looks
-    to the top of the picture. Returns [H, W, 3] uint8 RGB.
+    poses: T_wc [4, 4] m, at least one. Up is where the cameras' upper edges point on average; the
+    first camera looks to the top of the picture. Returns [H, W, 3] uint8 RGB.
     """
     stack = np.stack(poses)
     up = -stack[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
     forward = stack[0, :3, 2] - up * (stack[0, :3, 2] @ up)
     forward /= np.linalg.norm(forward) + 1e-12
-    axes = np.stack([np.cross(forward, up), -forward], axis=1)  # [3, 2] to the right, and down in the picture
+    axes = np.stack(
+        [np.cross(forward, up), -forward], axis=1
+    )  # [3, 2] to the right, and down in the picture
     height = cloud.points @ up
     keep = height < (stack[:, :3, 3] @ up).max() + _ABOVE
     points, colors = cloud.points[keep], cloud.colors[keep]

@@ -1,4 +1,6 @@
-"""Coloured points averaged in cubes, in bounded memory: when too many cubes are filled, their edge doubles."""
+"""Coloured points averaged in cubes, in bounded memory: when too many cubes are filled, their edge
+doubles.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +13,24 @@ _LOW = (1 << _BITS) - 1
 
 
 class VoxelGrid:
-    """Sums of what falls into every cube. edge: m of a cube's side; limit: cubes held before the edge doubles."""
+    """Sums of what falls into every cube. edge: m of a cube's side; limit: cubes held before the
+    edge doubles.
+    """
 
     def __init__(self, edge: float, limit: int = 4_000_000) -> None:
         self.edge = edge
         self._limit = limit
         self._keys = np.zeros(0, dtype=np.int64)
         self._rows = np.zeros((0, 7))  # sums of x y z (m) and r g b, and how many points
-        self._spans = np.zeros((0, 2), dtype=np.int32)  # first and last picture that filled the cube
+        self._spans = np.zeros(
+            (0, 2), dtype=np.int32
+        )  # first and last picture that filled the cube
         self._waiting: list[tuple[NDArray[np.int64], Array, NDArray[np.int32]]] = []
 
     def add(self, points: Array, colors: NDArray[np.uint8], picture: int) -> None:
-        """points: [n, 3] m; colours: [n, 3] RGB; picture: its number, which tells cubes seen once from others."""
+        """points: [n, 3] m; colours: [n, 3] RGB; picture: its number, which tells cubes seen once
+        from others.
+        """
         cells = np.floor(points / self.edge).astype(np.int64)
         inside = (np.abs(cells) < _HALF).all(axis=1)
         rows = np.column_stack([points, colors, np.ones(len(points))])[inside]
@@ -32,7 +40,9 @@ class VoxelGrid:
             self._settle()
 
     def cells(self, pictures: int = 2) -> tuple[Array, NDArray[np.uint8]]:
-        """The mean point ([n, 3] m) and mean colour ([n, 3] RGB) of every cube that so many pictures filled: 1 or 2."""
+        """The mean point ([n, 3] m) and mean colour ([n, 3] RGB) of every cube that so many
+        pictures filled: 1 or 2.
+        """
         self._settle()
         keep = slice(None) if pictures < 2 else self._spans[:, 0] != self._spans[:, 1]
         rows = self._rows[keep]
@@ -46,7 +56,9 @@ class VoxelGrid:
         self._keys, self._rows, self._spans = _summed(keys, rows, spans)
         while len(self._keys) > self._limit:
             self.edge *= 2
-            self._keys, self._rows, self._spans = _summed(_pack(_unpack(self._keys) >> 1), self._rows, self._spans)
+            self._keys, self._rows, self._spans = _summed(
+                _pack(_unpack(self._keys) >> 1), self._rows, self._spans
+            )
 
 
 def _pack(cells: NDArray[np.int64]) -> NDArray[np.int64]:

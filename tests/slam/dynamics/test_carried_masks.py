@@ -16,7 +16,9 @@ def tool() -> ModuleType:
     return load_tool("experiments/carried_masks.py")
 
 
-def run(tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: int, *steps: str) -> None:
+def run(
+    tool: ModuleType, monkeypatch: pytest.MonkeyPatch, root: Path, frames: int, *steps: str
+) -> None:
     write_sequence(root / "plane", frames, with_passer_by=True)
     words = ["--sequences", str(root / "plane"), "--out", str(root / "out"), "--steps", *steps]
     monkeypatch.setattr(sys, "argv", ["carried_masks", *words])
@@ -32,7 +34,9 @@ def test_it_says_how_much_of_the_people_and_of_the_rest_is_covered(
     for row in (one, ten):
         assert row["covered"] > 0.97, "left where it was, it would cover .85"
         assert 0 <= row["others"] < 0.01
-    assert f"| plane | 10 | {ten['iou']:.3f} |" in (tmp_path / "out" / "carried_masks.md").read_text()
+    assert (
+        f"| plane | 10 | {ten['iou']:.3f} |" in (tmp_path / "out" / "carried_masks.md").read_text()
+    )
 
 
 def test_likeness_counts_pixels(tool: ModuleType) -> None:
@@ -45,10 +49,14 @@ def test_likeness_counts_pixels(tool: ModuleType) -> None:
 def test_a_sequence_too_short_for_the_steps_is_named(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(SystemExit, match="plane: of 4 frames none with anybody in it has 4 after it"):
+    with pytest.raises(
+        SystemExit, match="plane: of 4 frames none with anybody in it has 4 after it"
+    ):
         run(tool, monkeypatch, tmp_path, 4, "1", "4")
 
 
-def test_steps_begin_at_one(tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_begin_at_one(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(SystemExit, match="1 or more, not 0"):
         run(tool, monkeypatch, tmp_path, 4, "0", "4")

@@ -45,9 +45,13 @@ def with_box(image: Depth, left: int, depth: float) -> Depth:
     return image
 
 
-def found(camera: Camera, now: Depth, before: list[Depth], T_cw: Array = STILL) -> NDArray[np.bool_]:
+def found(
+    camera: Camera, now: Depth, before: list[Depth], T_cw: Array = STILL
+) -> NDArray[np.bool_]:
     geometry = FreeSpaceChecker(camera)
-    comparison = geometry.compare(now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before])
+    comparison = geometry.compare(
+        now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before]
+    )
     return geometry.fine(geometry.movers(comparison))
 
 
@@ -107,13 +111,23 @@ def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
     assert came is not None
     assert came[90:150, 210:270].all()
     assert not came[:, :100].any()
-    assert masks.of(None, wall(1.0), STILL, seen, 13.0) is None, "all of it moves: the pose is wrong"
+    assert masks.of(None, wall(1.0), STILL, seen, 13.0) is None, (
+        "all of it moves: the pose is wrong"
+    )
     assert masks.of(None, box, STILL, seen, 13.0) is None
 
 
 def keyframe(index: int, t: float, nearest: Depth) -> Keyframe:
     nothing = OrbExtractor(CAMERA, 10)(np.zeros((240, 320, 3), np.uint8), wall())
-    return Keyframe(index, t, STILL, nothing, np.zeros(0, dtype=np.int64), np.zeros((30, 40), np.float32), nearest)
+    return Keyframe(
+        index,
+        t,
+        STILL,
+        nothing,
+        np.zeros(0, dtype=np.int64),
+        np.zeros((30, 40), np.float32),
+        nearest,
+    )
 
 
 def test_who_is_at_rest_is_of_use_to_tracking_but_stays_masked_to_watchers(tmp_path: Path) -> None:
@@ -122,19 +136,29 @@ def test_who_is_at_rest_is_of_use_to_tracking_but_stays_masked_to_watchers(tmp_p
     frames = [(rgb, depth, index / 5) for index, (rgb, depth, _) in enumerate(views)]
     tracker, seen = Tracker(CAMERA, features=500), []
 
-    def observer(view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker) -> None:
+    def observer(
+        view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
+    ) -> None:
         assert mask is not None
         assert tracker.mask is not None
         board = views[round(5 * view.t)][2]
         seen.append((mask[board].mean(), tracker.mask[board].mean()))
 
-    play(tracker, Live(CAMERA, frames), lambda view: views[round(5 * view.t)][2], tmp_path / "pictures", [observer])
+    play(
+        tracker,
+        Live(CAMERA, frames),
+        lambda view: views[round(5 * view.t)][2],
+        tmp_path / "pictures",
+        [observer],
+    )
     assert seen[0] == (1, 1)
     assert seen[-1] == (1, 0)
 
 
 def test_the_camera_may_move() -> None:
-    """Two views of the still room 20 cm apart: nothing moves; with a wrong pose something would seem to."""
+    """Two views of the still room 20 cm apart: nothing moves; with a wrong pose something would
+    seem to.
+    """
     path = camera_path(40)
     first, second = (render(room(), path[k])[1] for k in (0, 15))
     geometry = FreeSpaceChecker(CAMERA)
@@ -149,7 +173,9 @@ def test_the_lens_bends_back(x: float, y: float) -> None:
 
 
 def scene(seed: int, shift: float) -> tuple[Array, Observations, NDArray[np.bool_]]:
-    """300 points of shelves 3 to 4 m away and 40 of a cart at 1 m that has rolled by `shift` m since it was mapped."""
+    """300 points of shelves 3 to 4 m away and 40 of a cart at 1 m that has rolled by `shift` m
+    since it was mapped.
+    """
     rng = np.random.default_rng(seed)
     far = rng.uniform([-1.8, -1.3, 3.0], [1.8, 1.3, 4.0], (300, 3))
     near = rng.uniform([-0.4, 0.0, 0.9], [0.0, 0.35, 1.1], (40, 3))
@@ -161,7 +187,9 @@ def scene(seed: int, shift: float) -> tuple[Array, Observations, NDArray[np.bool
 
 
 def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
-    """At the edge of what noise allows: 1494 of 1500 worlds; from 3.5 cm on there is none that misses it."""
+    """At the edge of what noise allows: 1494 of 1500 worlds; from 3.5 cm on there is none that
+    misses it.
+    """
     found = 0
     for seed in range(200):
         points, seen, cart = scene(seed, 0.03)
@@ -175,7 +203,9 @@ def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
 def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shift: float) -> None:
     points, seen, cart = scene(seed, shift)
     dragged, inlier = optimize_pose(STILL, points, seen, REPROJECTION)
-    assert np.linalg.norm(dragged[:3, 3]) > shift, "the cart takes the pose along, and further than it went"
+    assert np.linalg.norm(dragged[:3, 3]) > shift, (
+        "the cart takes the pose along, and further than it went"
+    )
     assert inlier[~cart].mean() > 0.8, "and no residual shows it"
     pose, inlier, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(340, 9))
     assert moving[cart].mean() > 0.9
@@ -186,7 +216,9 @@ def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shif
 
 @given(st.integers(0, 10_000), st.floats(0.04, 0.09))
 def test_nine_near_points_do_not_take_the_pose_along(seed: int, shift: float) -> None:
-    """What a mask has missed of a passer-by, before 300 far points that agree with a pose wrong by centimetres."""
+    """What a mask has missed of a passer-by, before 300 far points that agree with a pose wrong by
+    centimetres.
+    """
     points, seen, cart = scene(seed, shift)
     points, seen, cart = points[:309], seen.take(np.arange(309)), cart[:309]
     dragged, _ = optimize_pose(STILL, points, seen, REPROJECTION)
@@ -212,19 +244,28 @@ def test_of_two_groups_the_one_that_is_long_known_is_the_world(seed: int, shift:
     points, walks = np.concatenate([wall, person]), np.arange(400) >= 100
     local = points + walks[:, None] * np.array([shift, 0, 0])
     pixels = CAMERA.project(local) + rng.normal(0, 0.5, (400, 2))
-    seen = Observations(pixels, local[:, 2] + rng.normal(0, 0.003, 400) * local[:, 2] ** 2, np.ones(400), np.ones(400))
+    seen = Observations(
+        pixels,
+        local[:, 2] + rng.normal(0, 0.003, 400) * local[:, 2] ** 2,
+        np.ones(400),
+        np.ones(400),
+    )
     dragged, _ = optimize_pose(STILL, points, seen, REPROJECTION)
     assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift, "most points are the person's"
     pose, _, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.where(walks, 5, 100))
     assert np.linalg.norm(pose[:3, 3]) < 0.5 * shift
     assert moving[walks].mean() > 0.9
     followed, _, _ = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(400, 5))
-    assert np.linalg.norm(followed[:3, 3]) > 0.5 * shift, "of points that are as long known the most are the world"
+    assert np.linalg.norm(followed[:3, 3]) > 0.5 * shift, (
+        "of points that are as long known the most are the world"
+    )
 
 
 def test_few_points_are_not_judged() -> None:
     points, seen, _ = scene(0, 0.02)
-    assert not moving_group(STILL, points[-20:], seen.take(np.arange(320, 340)), REPROJECTION, np.full(20, 9)).any()
+    assert not moving_group(
+        STILL, points[-20:], seen.take(np.arange(320, 340)), REPROJECTION, np.full(20, 9)
+    ).any()
 
 
 def test_a_point_that_moves_with_its_group_loses_weight_and_may_earn_it_again() -> None:
@@ -261,7 +302,9 @@ def test_depth_that_comes_late_is_carried_back() -> None:
     rgb, depth, _ = render(room()[:1], STILL)
     late = render(room()[:1], np.linalg.inv(lag))[1]
     extract = OrbExtractor(CAMERA, 300)
-    truth, told, untold = (extract(rgb, *rest).depths for rest in ((depth,), (late, None, lag), (late,)))
+    truth, told, untold = (
+        extract(rgb, *rest).depths for rest in ((depth,), (late, None, lag), (late,))
+    )
     assert np.nanmax(np.abs(told - truth)) < 0.002
     assert np.nanmedian(np.abs(untold - truth)) > 0.02
 
@@ -275,5 +318,7 @@ def test_a_passer_by_spoils_less_without_any_mask() -> None:
         tracker = Tracker(CAMERA, features=500, method=method)
         for t, (rgb, depth) in zip(stamps, views, strict=True):
             tracker.track(rgb, depth, float(t))
-        errors.append(score(Trajectory(stamps, path), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"])
+        errors.append(
+            score(Trajectory(stamps, path), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"]
+        )
     assert errors[1] < 0.2 * errors[0]

@@ -5,7 +5,14 @@ import pytest
 from numpy.typing import NDArray
 from plane_world import texture
 
-from cohdc_train.slam.dynamics.mask_propagation import Half, Mask, Propagation, cut_by_depth, halve, halve_mask
+from cohdc_train.slam.dynamics.mask_propagation import (
+    Half,
+    Mask,
+    Propagation,
+    cut_by_depth,
+    halve,
+    halve_mask,
+)
 
 HEIGHT, WIDTH = 240, 320
 WALL, PERSON = 3.0, 1.5  # m
@@ -14,7 +21,9 @@ _SHIRT = texture(np.random.default_rng(2), 100, 80, patches=200)
 
 
 def scene(left: int, depth: float = PERSON) -> tuple[Half, Mask]:
-    """A textured board, 80 x 100 px, its left edge at `left`, before a wall. Returns the frame and the true mask."""
+    """A textured board, 80 x 100 px, its left edge at `left`, before a wall. Returns the frame and
+    the true mask.
+    """
     rgb, meters = _WALLPAPER.copy(), np.full((HEIGHT, WIDTH), WALL, dtype=np.float32)
     mask = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
     begin, end = max(left, 0), min(left + 80, WIDTH)
@@ -120,7 +129,9 @@ def test_feet_do_not_run_out_over_the_floor_they_stand_on() -> None:
     mask[40:42] = False  # and a rim is missing where depth breaks
     for _ in range(10):
         mask = cut_by_depth(mask, depth)
-    assert not (mask & ~truth)[83:].any(), "but for the corners beside the feet, where wall and floor are mixed"
+    assert not (mask & ~truth)[83:].any(), (
+        "but for the corners beside the feet, where wall and floor are mixed"
+    )
     assert iou(mask, truth) > 0.97
 
 

@@ -1,4 +1,6 @@
-"""Corners: the mask before the budget, the grid, the depth that is trusted; masks made of detections."""
+"""Corners: the mask before the budget, the grid, the depth that is trusted; masks made of
+detections.
+"""
 
 import cv2
 import numpy as np
@@ -34,12 +36,18 @@ def test_the_mask_costs_no_budget() -> None:
 
 def test_corners_spread_over_cells_and_levels() -> None:
     rng = np.random.default_rng(0)
-    strong = np.column_stack([rng.uniform(0, 31, size=(300, 2)), np.zeros(300), rng.uniform(100, 200, 300)])
-    weak = np.column_stack([[40.0 + 32 * k for k in range(8)], np.full(8, 40.0), np.zeros(8), np.full(8, 5.0)])
+    strong = np.column_stack(
+        [rng.uniform(0, 31, size=(300, 2)), np.zeros(300), rng.uniform(100, 200, 300)]
+    )
+    weak = np.column_stack(
+        [[40.0 + 32 * k for k in range(8)], np.full(8, 40.0), np.zeros(8), np.full(8, 5.0)]
+    )
     higher = np.array([[10.0, 10.0, 1.0, 7.0], [12.0, 10.0, 1.0, 9.0]])
     table = np.concatenate([strong, weak, higher])
     chosen = spread(table, quota=np.array([20, 1]))
-    assert set(range(300, 308)) <= set(chosen.tolist()), "one weak corner of every cell goes before a crowd's second"
+    assert set(range(300, 308)) <= set(chosen.tolist()), (
+        "one weak corner of every cell goes before a crowd's second"
+    )
     best = np.argsort(-strong[:, 3])[:12]
     assert set(chosen[chosen < 300].tolist()) == set(best.tolist())
     assert chosen[chosen >= 308].tolist() == [309]
@@ -52,7 +60,9 @@ def test_no_earlier_frame_decides_which_corners_are_chosen() -> None:
     rgb = np.repeat((80 + 90 * squares)[..., None], 3, axis=2).astype(np.uint8)
     depth = np.full((240, 320), 2.0, dtype=np.float32)
     fresh, used = OrbExtractor(CAMERA, 100), OrbExtractor(CAMERA, 100)
-    used(np.full_like(rgb, 90), depth)  # a picture without corners: the next one is sought with the lowest threshold
+    used(
+        np.full_like(rgb, 90), depth
+    )  # a picture without corners: the next one is sought with the lowest threshold
     first, second = fresh(rgb, depth), used(rgb, depth)
     np.testing.assert_array_equal(first.pixels, second.pixels)
     np.testing.assert_array_equal(first.octaves, second.octaves)
@@ -115,14 +125,20 @@ def test_doubtful_contours_get_a_wider_band_and_are_never_dropped() -> None:
 def test_without_doubt_all_contours_grow_alike() -> None:
     box = (100.0, 100.0, 150.0, 150.0)
     masks = [
-        dynamic_mask(detections((box, 0, 0.9, quality)), frozenset([0]), Culling(dilate=10, doubt=0.0))
+        dynamic_mask(
+            detections((box, 0, 0.9, quality)), frozenset([0]), Culling(dilate=10, doubt=0.0)
+        )
         for quality in (0.0, 1.0)
     ]
     np.testing.assert_array_equal(*masks)
 
 
 def test_only_dynamic_classes_above_the_score_count() -> None:
-    left, middle, right = (10.0, 10.0, 40.0, 40.0), (100.0, 10.0, 140.0, 40.0), (200.0, 10.0, 240.0, 40.0)
+    left, middle, right = (
+        (10.0, 10.0, 40.0, 40.0),
+        (100.0, 10.0, 140.0, 40.0),
+        (200.0, 10.0, 240.0, 40.0),
+    )
     found = detections((left, 0, 0.9, 1.0), (middle, 1, 0.9, 1.0), (right, 0, 0.3, 1.0))
     mask = dynamic_mask(found, frozenset([0]), Culling(dilate=0))
     assert mask.sum() == 30 * 30
@@ -133,13 +149,17 @@ def test_only_dynamic_classes_above_the_score_count() -> None:
 def test_the_papers_filter_leaves_a_doubted_contour_out() -> None:
     box = (10.0, 10.0, 30.0, 30.0)
     for quality, dynamic in ((0.95, True), (0.85, False)):
-        found = dynamic_mask(detections((box, 0, 0.9, quality)), frozenset([0]), Culling(quality=0.9, dilate=0))
+        found = dynamic_mask(
+            detections((box, 0, 0.9, quality)), frozenset([0]), Culling(quality=0.9, dilate=0)
+        )
         assert found.any() == dynamic
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 40.0))
 @settings(max_examples=30, deadline=None)
-def test_grow_looks_at_a_window_and_gives_what_the_whole_image_would(seed: int, radius: float) -> None:
+def test_grow_looks_at_a_window_and_gives_what_the_whole_image_would(
+    seed: int, radius: float
+) -> None:
     rng = np.random.default_rng(seed)
     mask = np.zeros((60, 80), bool)
     for row, column in zip(rng.integers(0, 60, 3), rng.integers(0, 80, 3), strict=True):
@@ -159,7 +179,9 @@ def test_grow_is_a_disc() -> None:
     assert grow(mask, 0.0).sum() == 1
 
 
-@pytest.mark.parametrize("bad", [{"dilate": -1}, {"score": 1.5}, {"doubt": -0.1}, {"doubt": float("nan")}])
+@pytest.mark.parametrize(
+    "bad", [{"dilate": -1}, {"score": 1.5}, {"doubt": -0.1}, {"doubt": float("nan")}]
+)
 def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
     with pytest.raises(DataError, match=next(iter(bad))):
         Culling(**bad)  # type: ignore[arg-type]
@@ -168,10 +190,19 @@ def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
 def test_mutually_nearest_descriptors_are_those_of_a_search_through_all() -> None:
     rng = np.random.default_rng(0)
     there = rng.integers(0, 2**63, (40, 4)).astype(np.uint64)
-    here = np.concatenate([there[rng.permutation(40)[:25]], rng.integers(0, 2**63, (20, 4)).astype(np.uint64)])
+    here = np.concatenate(
+        [there[rng.permutation(40)[:25]], rng.integers(0, 2**63, (20, 4)).astype(np.uint64)]
+    )
     here[:, 0] ^= np.uint64(2) ** rng.integers(0, 30, len(here)).astype(np.uint64)
     n = len(here)
-    features = Features(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n, np.int64), here, np.zeros(n), np.zeros(n, bool))
+    features = Features(
+        np.zeros((n, 2)),
+        np.zeros((n, 2)),
+        np.zeros(n, np.int64),
+        here,
+        np.zeros(n),
+        np.zeros(n, bool),
+    )
     matches = match_descriptors(np.arange(100, 140), there, features)
     bits = hamming(there[:, None], here)
     nearest = (bits == bits.min(axis=0)) & (bits == bits.min(axis=1, keepdims=True)) & (bits <= 60)

@@ -20,7 +20,10 @@ def seen(points: Array, twist: Array) -> Features:
     late = np.zeros(len(points))
     for _ in range(20):  # the row depends on the moment, and the moment on the row
         local = np.concatenate(
-            [to_local(exp_se3(twist * t), point[None]) for t, point in zip(late, points, strict=True)]
+            [
+                to_local(exp_se3(twist * t), point[None])
+                for t, point in zip(late, points, strict=True)
+            ]
         )
         pixels = CAMERA.project(local)
         late = ROLLING.readout * (pixels[:, 1] / CAMERA.height - 0.5)
@@ -35,7 +38,9 @@ def test_corners_are_where_the_middle_row_s_moment_has_them(speed: list[float]) 
     result = undo_rolling_shutter(measured, ROLLING, twist)
     np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.03)
     np.testing.assert_allclose(result.depths, points[:, 2], atol=3e-4)
-    np.testing.assert_array_equal(undo_rolling_shutter(measured, CAMERA, twist).points, measured.points)
+    np.testing.assert_array_equal(
+        undo_rolling_shutter(measured, CAMERA, twist).points, measured.points
+    )
 
 
 def test_a_corner_without_depth_moves_like_the_others() -> None:
@@ -47,4 +52,6 @@ def test_a_corner_without_depth_moves_like_the_others() -> None:
     assert np.isnan(result.depths).sum() == 10
     np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.1)
     nothing = replace(measured, depths=np.full(30, np.nan))
-    np.testing.assert_array_equal(undo_rolling_shutter(nothing, ROLLING, twist).points, measured.points)
+    np.testing.assert_array_equal(
+        undo_rolling_shutter(nothing, ROLLING, twist).points, measured.points
+    )

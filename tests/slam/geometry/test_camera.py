@@ -17,11 +17,18 @@ FREIBURG1 = load_camera(config_path("slam/freiburg1.yaml"))
 
 
 @pytest.mark.parametrize(
-    ("name", "fx", "k1"), [("freiburg1", 517.3, 0.2624), ("freiburg2", 520.9, 0.2312), ("freiburg3", 535.4, 0.0)]
+    ("name", "fx", "k1"),
+    [("freiburg1", 517.3, 0.2624), ("freiburg2", 520.9, 0.2312), ("freiburg3", 535.4, 0.0)],
 )
 def test_shipped_presets(name: str, fx: float, k1: float) -> None:
     camera = load_camera(config_path(f"slam/{name}.yaml"))
-    assert (camera.fx, camera.k1, camera.width, camera.height, camera.depth_scale) == (fx, k1, 640, 480, 5000)
+    assert (camera.fx, camera.k1, camera.width, camera.height, camera.depth_scale) == (
+        fx,
+        k1,
+        640,
+        480,
+        5000,
+    )
 
 
 @pytest.mark.parametrize(
@@ -64,7 +71,9 @@ def test_order_of_choice(tmp_path: Path) -> None:
         ("- 1\n", ":1: a camera file holds lines"),
     ],
 )
-def test_a_broken_camera_file_is_one_line_with_its_place(tmp_path: Path, text: str, said: str) -> None:
+def test_a_broken_camera_file_is_one_line_with_its_place(
+    tmp_path: Path, text: str, said: str
+) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(text)
     with pytest.raises(DataError) as caught:
@@ -90,7 +99,11 @@ def test_undistortion_inverts_the_distortion(pixels: list[tuple[float, float]]) 
     np.testing.assert_allclose(FREIBURG1.undistort(distort(FREIBURG1, flat)), flat, atol=0.02)
 
 
-@given(st.lists(st.tuples(st.floats(0, 639), st.floats(0, 479), st.floats(0.3, 8)), min_size=1, max_size=20))
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 639), st.floats(0, 479), st.floats(0.3, 8)), min_size=1, max_size=20
+    )
+)
 def test_project_inverts_backproject(rows: list[tuple[float, float, float]]) -> None:
     table = np.array(rows)
     points = FREIBURG1.backproject(table[:, :2], table[:, 2])

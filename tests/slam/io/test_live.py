@@ -71,7 +71,9 @@ class Writer(threading.Thread):
         (self.folder / "done").touch()
 
 
-def test_a_folder_that_grows_gives_what_the_whole_folder_gives(recorded: Path, tmp_path: Path) -> None:
+def test_a_folder_that_grows_gives_what_the_whole_folder_gives(
+    recorded: Path, tmp_path: Path
+) -> None:
     writer = Writer(recorded, tmp_path / "room")
     writer.start()
     live = slam(sequence=tmp_path / "room", out=tmp_path / "run", features=400, follow=True)
@@ -81,7 +83,9 @@ def test_a_folder_that_grows_gives_what_the_whole_folder_gives(recorded: Path, t
     assert live["without_depth"] == 0
     files = [(tmp_path / name / "trajectory.txt").read_bytes() for name in ("run", "whole")]
     assert files[0] == files[1], "bit for bit"
-    assert {"map.ply", "metrics.json", "pictures"} <= {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"map.ply", "metrics.json", "pictures"} <= {
+        path.name for path in (tmp_path / "run").iterdir()
+    }
 
 
 def followed(folder: Path, idle: float = 0.2) -> list[View]:
@@ -104,7 +108,12 @@ def test_silence_ends_it_and_what_has_no_partner_is_counted(recorded: Path, tmp_
 def test_nothing_at_all_is_an_error_that_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "rgbd_dataset_freiburg1_none").mkdir()
     with pytest.raises(DataError, match="no frame came"):
-        slam(sequence=tmp_path / "rgbd_dataset_freiburg1_none", out=tmp_path / "run", follow=True, idle=0.1)
+        slam(
+            sequence=tmp_path / "rgbd_dataset_freiburg1_none",
+            out=tmp_path / "run",
+            follow=True,
+            idle=0.1,
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["rgbd_dataset_freiburg1_none"]
 
 
@@ -125,7 +134,10 @@ def test_a_camera_may_fill_one_buffer_again_and_again() -> None:
 
 
 def test_a_broken_line_or_image_later_on_is_told_and_left_out(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("cohdc_train.slam.io.growing_sequence._PATIENCE", 0.1)
     folder = Path(shutil.copytree(recorded, tmp_path / "room"))
@@ -141,7 +153,9 @@ def test_a_broken_line_or_image_later_on_is_told_and_left_out(
     assert f"{broken.name}: not there, or not whole" in said[1]
 
 
-def test_a_first_image_that_does_not_fit_the_camera_is_an_error(recorded: Path, tmp_path: Path) -> None:
+def test_a_first_image_that_does_not_fit_the_camera_is_an_error(
+    recorded: Path, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(recorded, tmp_path / "room"))
     (folder / "done").touch()
     for file in (folder / "rgb").iterdir():
@@ -163,7 +177,14 @@ def test_the_nearest_partner_is_taken_once(tmp_path: Path) -> None:
         pairs.append((first.t, second.t))
         return View(first.t, "", "", np.zeros((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32))
 
-    list(Followed(tmp_path, CAMERA, type(layout)(layout.first, layout.second, layout.max_difference, view), 1))
+    list(
+        Followed(
+            tmp_path,
+            CAMERA,
+            type(layout)(layout.first, layout.second, layout.max_difference, view),
+            1,
+        )
+    )
     assert pairs == [(0.0, 0.004), (0.033, 0.031), (0.066, 0.085), (0.1, 0.119)]
 
 
@@ -180,7 +201,9 @@ def test_a_camera_of_ones_own(tmp_path: Path) -> None:
         Live(CAMERA, frames(FRAMES)),
         out=tmp_path / "run",
         features=400,
-        observers=[lambda view, mask, record, tracker: seen.append((view.t, record.pose.tracked, mask))],
+        observers=[
+            lambda view, mask, record, tracker: seen.append((view.t, record.pose.tracked, mask))
+        ],
     )
     assert metrics["coverage"] == 1.0
     assert [row[0] for row in seen] == [index / 30 for index in range(FRAMES)]
@@ -193,8 +216,12 @@ class RealSense(ModuleType):
 
     def __init__(self) -> None:
         super().__init__("pyrealsense2")
-        lens = SimpleNamespace(fx=260.0, fy=260.0, ppx=159.5, ppy=119.5, width=320, height=240, coeffs=[0.0] * 5)
-        stream = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens))
+        lens = SimpleNamespace(
+            fx=260.0, fy=260.0, ppx=159.5, ppy=119.5, width=320, height=240, coeffs=[0.0] * 5
+        )
+        stream = SimpleNamespace(
+            as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens)
+        )
         sensor = SimpleNamespace(get_depth_scale=lambda: 0.001)
         device = SimpleNamespace(first_depth_sensor=lambda: sensor)
         profile = SimpleNamespace(get_device=lambda: device, get_stream=lambda _: stream)
@@ -203,9 +230,13 @@ class RealSense(ModuleType):
         self.format = SimpleNamespace(z16=1, rgb8=2)
         self.align = lambda _: SimpleNamespace(process=lambda pair: pair)
         self.config = lambda: SimpleNamespace(enable_stream=lambda *_: None)
-        self.pipeline = lambda: SimpleNamespace(start=lambda _: profile, wait_for_frames=lambda: self._next(coming))
+        self.pipeline = lambda: SimpleNamespace(
+            start=lambda _: profile, wait_for_frames=lambda: self._next(coming)
+        )
 
-    def _next(self, coming: Iterator[tuple[NDArray[np.uint8], NDArray[np.float32], float]]) -> SimpleNamespace:
+    def _next(
+        self, coming: Iterator[tuple[NDArray[np.uint8], NDArray[np.float32], float]]
+    ) -> SimpleNamespace:
         try:
             rgb, depth, t = next(coming)
         except StopIteration:
@@ -213,7 +244,9 @@ class RealSense(ModuleType):
         color = SimpleNamespace(get_data=lambda: rgb)
         units = SimpleNamespace(get_data=lambda: np.nan_to_num(1000 * depth).astype(np.uint16))
         times = {"get_timestamp": lambda: 1000 * t}
-        return SimpleNamespace(get_color_frame=lambda: color, get_depth_frame=lambda: units, **times)
+        return SimpleNamespace(
+            get_color_frame=lambda: color, get_depth_frame=lambda: units, **times
+        )
 
 
 def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,7 +287,9 @@ def test_what_a_live_run_has_is_written_when_its_camera_fails(
     assert (tmp_path / "run" / "map.ply").exists()
 
 
-def test_ctrl_c_ends_a_live_run_after_the_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_ends_a_live_run_after_the_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before, seen = signal.getsignal(signal.SIGINT), []
 
     def interrupt(view: View, mask: object, record: object, tracker: object) -> None:
@@ -262,7 +297,9 @@ def test_ctrl_c_ends_a_live_run_after_the_frame(tmp_path: Path, capsys: pytest.C
         if len(seen) == 3:
             signal.raise_signal(signal.SIGINT)
 
-    metrics = run_source(Live(CAMERA, frames(1000)), out=tmp_path / "run", features=400, observers=[interrupt])
+    metrics = run_source(
+        Live(CAMERA, frames(1000)), out=tmp_path / "run", features=400, observers=[interrupt]
+    )
     assert metrics["frames"] == len(seen) == 3
     assert "stopping; Ctrl-C again" in capsys.readouterr().err
     assert (tmp_path / "run" / "trajectory.txt").exists()

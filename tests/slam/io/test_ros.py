@@ -25,14 +25,20 @@ from cohdc_train.trajectory.trajectory import read_tum
 FRAMES = 8
 
 
-def image(encoding: str, pixels: NDArray[Any], padding: int = 0, big: bool = False) -> SimpleNamespace:
+def image(
+    encoding: str, pixels: NDArray[Any], padding: int = 0, big: bool = False
+) -> SimpleNamespace:
     """A sensor_msgs/Image as a driver fills it: data is an array of bytes, rows may be padded."""
     height, width = pixels.shape[:2]
-    rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))).view(np.uint8)
+    rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))).view(
+        np.uint8
+    )
     padded = np.pad(rows.reshape(height, -1), ((0, 0), (0, padding)))
     data = array("B", padded.tobytes())
     step = padded.shape[1]
-    return SimpleNamespace(height=height, width=width, encoding=encoding, is_bigendian=int(big), step=step, data=data)
+    return SimpleNamespace(
+        height=height, width=width, encoding=encoding, is_bigendian=int(big), step=step, data=data
+    )
 
 
 @pytest.fixture
@@ -50,7 +56,9 @@ def test_colour_encodings(rgb: NDArray[np.uint8], padding: int) -> None:
         "bgra8": np.concatenate([rgb[..., ::-1], alpha], axis=2),
     }
     for encoding, pixels in messages.items():
-        np.testing.assert_array_equal(rgb_of(image(encoding, pixels, padding)), rgb, err_msg=encoding)
+        np.testing.assert_array_equal(
+            rgb_of(image(encoding, pixels, padding)), rgb, err_msg=encoding
+        )
     gray = rgb_of(image("mono8", rgb[..., 0], padding))
     np.testing.assert_array_equal(gray, np.repeat(rgb[..., :1], 3, axis=2))
 
@@ -79,7 +87,13 @@ def test_messages_that_cannot_be_used_are_named(rgb: NDArray[np.uint8]) -> None:
 
 def info(**changes: Any) -> SimpleNamespace:
     k = [CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1]
-    values: dict[str, Any] = {"width": 320, "height": 240, "k": k, "d": [], "distortion_model": "plumb_bob"}
+    values: dict[str, Any] = {
+        "width": 320,
+        "height": 240,
+        "k": k,
+        "d": [],
+        "distortion_model": "plumb_bob",
+    }
     return SimpleNamespace(**values | changes)
 
 
@@ -88,7 +102,10 @@ def test_camera_info() -> None:
     assert plain == Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1000.0)
     bent = camera_of(info(d=[0.1, -0.2, 0.001, 0.002, 0.3]))
     assert (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3) == (0.1, -0.2, 0.001, 0.002, 0.3)
-    assert camera_of(info(d=[0.1, 0, 0, 0, 0, 0, 0, 0], distortion_model="rational_polynomial")).k1 == 0.1
+    assert (
+        camera_of(info(d=[0.1, 0, 0, 0, 0, 0, 0, 0], distortion_model="rational_polynomial")).k1
+        == 0.1
+    )
     with pytest.raises(DataError, match="'equidistant' of 4 coefficients"):
         camera_of(info(d=[0.1] * 4, distortion_model="equidistant"))
     with pytest.raises(DataError, match="of 8 coefficients"):
@@ -102,7 +119,9 @@ def pose_message() -> SimpleNamespace:
 
 
 def test_poses_go_out_in_the_axes_of_ros() -> None:
-    """The first camera looks along x with its upper edge along z; what lies 2 m ahead of it lies at x = 2 m."""
+    """The first camera looks along x with its upper edge along z; what lies 2 m ahead of it lies at
+    x = 2 m.
+    """
     T_wc = np.eye(4)
     T_wc[:3, 3] = (0.5, 0.25, 3.0)  # right, down, forward
     message = pose_message()
@@ -157,7 +176,9 @@ class Node:
     def declare_parameter(self, name: str, value: Any) -> SimpleNamespace:
         return SimpleNamespace(value=self.parameters.get(name, value))
 
-    def create_subscription(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
+    def create_subscription(
+        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any
+    ) -> None:
         self.callbacks[topic] = callback
 
     def create_publisher(self, kind: Any, topic: str, depth: int) -> Publisher:
@@ -177,11 +198,16 @@ def drive(node: Any) -> None:
     """In the place of rclpy.spin: a camera that waits for each pose, then Ctrl-C."""
     node.callbacks["color/camera_info"](info())
     answered = threading.Event()
-    node.publishers["pose"].publish = lambda m: (node.publishers["pose"].sent.append(m), answered.set())
+    node.publishers["pose"].publish = lambda m: (
+        node.publishers["pose"].sent.append(m),
+        answered.set(),
+    )
     for index, T_wc in enumerate(camera_path(FRAMES)):
         rgb, depth, _ = render(room(), T_wc)
         color = image("bgr8", rgb[..., ::-1])
-        color.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=index * 33_000_000), frame_id="optical")
+        color.header = SimpleNamespace(
+            stamp=SimpleNamespace(sec=5, nanosec=index * 33_000_000), frame_id="optical"
+        )
         node._pairs.callback(color, image("16UC1", (depth * 1000).astype(np.uint16)))
         assert answered.wait(20)
         answered.clear()
@@ -196,7 +222,10 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         "rclpy.node": {"Node": Node},
         "rclpy.qos": {"qos_profile_sensor_data": None},
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
-        "message_filters": {"Subscriber": lambda *_, **__: None, "ApproximateTimeSynchronizer": Synchronizer},
+        "message_filters": {
+            "Subscriber": lambda *_, **__: None,
+            "ApproximateTimeSynchronizer": Synchronizer,
+        },
         "geometry_msgs": {},
         "geometry_msgs.msg": {"PoseStamped": Message},
         "nav_msgs": {},
@@ -212,7 +241,9 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return load_tool("ros2/cohdc_slam_node.py")
 
 
-def test_the_node_publishes_and_writes(ros: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_node_publishes_and_writes(
+    ros: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     nodes = []
 
     class Noted(ros.SlamNode):  # type: ignore[misc, name-defined]
@@ -235,7 +266,9 @@ def test_the_node_publishes_and_writes(ros: ModuleType, tmp_path: Path, monkeypa
     assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
 
 
-def test_the_newest_frame_replaces_the_one_that_waits(ros: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newest_frame_replaces_the_one_that_waits(
+    ros: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(ros, "WAIT", 0.01)
     node = ros.SlamNode()
     for second in (1, 2, 3):

@@ -1,4 +1,6 @@
-"""A rectified stereo pair: Q against OpenCV's, depth against the truth, a sequence through the command."""
+"""A rectified stereo pair: Q against OpenCV's, depth against the truth, a sequence through the
+command.
+"""
 
 import json
 from pathlib import Path
@@ -31,14 +33,18 @@ def right_of(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def write_stereo(folder: Path, frames: int, with_passer_by: bool = False) -> Path:
-    """plane_world's folder with left/ and right/ in the place of rgb/ and depth/; right stamps are 1 ms late."""
+    """plane_world's folder with left/ and right/ in the place of rgb/ and depth/; right stamps are
+    1 ms late.
+    """
     write_sequence(folder, frames, with_passer_by)
     (folder / "right").mkdir()
     lines = []
     for index, pose in enumerate(camera_path(frames)):
         things = [*room(), passer_by(index)] if with_passer_by else room()
         name = f"right/{index:04d}.png"
-        cv2.imwrite(str(folder / name), cv2.cvtColor(render(things, right_of(pose))[0], cv2.COLOR_RGB2BGR))
+        cv2.imwrite(
+            str(folder / name), cv2.cvtColor(render(things, right_of(pose))[0], cv2.COLOR_RGB2BGR)
+        )
         lines.append(f"{100.001 + index / 30:.6f} {name}")
     (folder / "right.txt").write_text("\n".join(lines) + "\n")
     (folder / "rgb.txt").rename(folder / "left.txt")
@@ -48,13 +54,23 @@ def write_stereo(folder: Path, frames: int, with_passer_by: bool = False) -> Pat
 
 
 @settings(max_examples=25)
-@given(st.floats(100, 900), st.floats(0, 640), st.floats(0, 480), st.floats(0.02, 1.0), st.integers(0, 999))
-def test_reprojection_is_opencvs(f: float, cx: float, cy: float, baseline: float, seed: int) -> None:
+@given(
+    st.floats(100, 900),
+    st.floats(0, 640),
+    st.floats(0, 480),
+    st.floats(0.02, 1.0),
+    st.integers(0, 999),
+)
+def test_reprojection_is_opencvs(
+    f: float, cx: float, cy: float, baseline: float, seed: int
+) -> None:
     camera = Camera(f, f, cx, cy, 40, 30, 1.0, baseline=baseline)
     K, none, T = camera.matrix(), np.zeros(5), np.array([[-baseline], [0], [0]])
     theirs = cv2.stereoRectify(K, none, K, none, (40, 30), np.eye(3), T, alpha=0)[4]
     Q = reprojection_matrix(camera)
-    np.testing.assert_allclose(theirs[3], Q[3], rtol=1e-9, atol=1e-9, err_msg="the sign and the principal columns")
+    np.testing.assert_allclose(
+        theirs[3], Q[3], rtol=1e-9, atol=1e-9, err_msg="the sign and the principal columns"
+    )
     disparity = np.random.default_rng(seed).uniform(0.5, 100, (30, 40)).astype(np.float32)
     expected = cv2.reprojectImageTo3D(disparity, Q.astype(np.float64), ddepth=cv2.CV_32F)
     points = reproject(disparity, Q)
@@ -71,7 +87,9 @@ def test_depth_of_a_pair_is_the_true_depth() -> None:
     matched = found > 0
     assert found.shape == depth.shape
     assert found.dtype == np.float32
-    assert matched[:, 64:].mean() > 0.8, "beyond the border where the right camera sees nothing, most is matched"
+    assert matched[:, 64:].mean() > 0.8, (
+        "beyond the border where the right camera sees nothing, most is matched"
+    )
     disparity_error = PAIR.fx * BASELINE * np.abs(1 / found[matched] - 1 / depth[matched])
     assert np.median(disparity_error) < 0.2
     assert np.mean(disparity_error > 1) < 0.05
@@ -80,7 +98,15 @@ def test_depth_of_a_pair_is_the_true_depth() -> None:
 @pytest.mark.slow
 def test_a_stereo_sequence_is_tracked(tmp_path: Path) -> None:
     sequence = write_stereo(tmp_path / "pair", 30, with_passer_by=True)
-    words = ["slam", "--sequence", str(sequence), "--masks", str(sequence / "masks"), "--out", str(tmp_path / "run")]
+    words = [
+        "slam",
+        "--sequence",
+        str(sequence),
+        "--masks",
+        str(sequence / "masks"),
+        "--out",
+        str(tmp_path / "run"),
+    ]
     assert main([*words, "--features", "500", "--cloud"]) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["frames"] == 30
@@ -103,7 +129,10 @@ def test_a_camera_with_a_baseline_needs_no_depth_scale(tmp_path: Path) -> None:
         (CAMERA_YAML, "needs baseline"),
         (STEREO_YAML + "k1: 0.1\n", "no distortion"),
         (STEREO_YAML.replace("fy: 260", "fy: 200"), "fx = fy"),
-        (STEREO_YAML.replace("0.12", "-0.12"), "camera.yaml:7: baseline cannot be below 0, and is -0.12"),
+        (
+            STEREO_YAML.replace("0.12", "-0.12"),
+            "camera.yaml:7: baseline cannot be below 0, and is -0.12",
+        ),
         (STEREO_YAML.replace("baseline: 0.12", ""), "missing depth_scale"),
     ],
     ids=["no baseline", "distortion", "two focal lengths", "negative", "neither"],
@@ -123,5 +152,7 @@ def test_a_camera_that_is_no_rectified_pair_is_refused(
 def test_pairs_that_are_not_simultaneous_are_none(tmp_path: Path) -> None:
     sequence = write_stereo(tmp_path / "pair", 2)
     (sequence / "right.txt").write_text("100.010 right/0000.png\n")
-    with pytest.raises(DataError, match=r"pair: no image of left\.txt lies within 0\.005 s of one of right\.txt"):
+    with pytest.raises(
+        DataError, match=r"pair: no image of left\.txt lies within 0\.005 s of one of right\.txt"
+    ):
         Recorded(sequence, PAIR, stereo_layout(PAIR))

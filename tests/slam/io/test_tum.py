@@ -35,7 +35,10 @@ def test_nearest_association_one_to_one(tmp_path: Path) -> None:
     [
         ("1.0 rgb/1.000.png extra\n", "rgb.txt:1: expected 'timestamp filename', found 3 words"),
         ("# c\nsoon rgb/1.000.png\n", "rgb.txt:2: time stamp 'soon' is not a number"),
-        ("1.0 rgb/1.000.png\n0.5 rgb/1.000.png\n", "rgb.txt:2: time stamp 0.5 does not come after 1.0"),
+        (
+            "1.0 rgb/1.000.png\n0.5 rgb/1.000.png\n",
+            "rgb.txt:2: time stamp 0.5 does not come after 1.0",
+        ),
         ("1.0 rgb/gone.png\n", "rgb.txt:1: rgb/gone.png does not exist"),
         ("# nothing\n", "rgb.txt: lists no image"),
         ("9.0 rgb/1.000.png\n", "no image of rgb.txt lies within 0.02 s"),
@@ -73,7 +76,9 @@ def test_images_that_do_not_fit_are_named(tmp_path: Path) -> None:
     (tmp_path / "empty.png").touch()
     with pytest.raises(DataError, match=r"small\.png: image is 160x120, the camera says 320x240"):
         read_depth(tmp_path / "small.png", CAMERA)
-    with pytest.raises(DataError, match=r"eight\.png: depth must be one channel of 16 bit, not uint8"):
+    with pytest.raises(
+        DataError, match=r"eight\.png: depth must be one channel of 16 bit, not uint8"
+    ):
         read_depth(tmp_path / "eight.png", CAMERA)
     for name in ("text.png", "empty.png"):
         with pytest.raises(DataError, match=f"{name}: not an image"):

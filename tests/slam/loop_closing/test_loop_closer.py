@@ -32,7 +32,9 @@ def views() -> list[View]:
 
 
 def run(views: list[View], loops: bool) -> Run:
-    """With corners on whole pixels, or it would not drift; the motion always starts from the latest frame's pose."""
+    """With corners on whole pixels, or it would not drift; the motion always starts from the latest
+    frame's pose.
+    """
     tracker, poses = Tracker(CAMERA, features=200, method=Method(loops=loops, refinement=False)), []
     for index, (rgb, depth) in enumerate(views):
         poses.append(tracker.track(rgb, depth, index / 30))
@@ -54,7 +56,9 @@ def drifting(views: list[View]) -> Run:
 
 def ate(tracker: Tracker) -> float:
     """RMSE, m."""
-    return score(Trajectory(np.arange(FRAMES) / 30, TRUTH), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"]
+    return score(Trajectory(np.arange(FRAMES) / 30, TRUTH), Trajectory(*tracker.trajectory()))[
+        "ate_m"
+    ]["rmse"]
 
 
 def test_closing_the_loop_takes_out_the_drift(drifting: Run, closed: Run) -> None:
@@ -65,7 +69,9 @@ def test_closing_the_loop_takes_out_the_drift(drifting: Run, closed: Run) -> Non
 
 
 def test_the_camera_lands_on_the_closed_map_at_once(drifting: Run, closed: Run) -> None:
-    ends = [poses[-1].T_wc @ inverse(inverse(TRUTH[0]) @ TRUTH[-1]) for _, poses in (drifting, closed)]
+    ends = [
+        poses[-1].T_wc @ inverse(inverse(TRUTH[0]) @ TRUTH[-1]) for _, poses in (drifting, closed)
+    ]
     off = [float(np.linalg.norm(end[:3, 3])) for end in ends]
     assert off[1] < 0.3 * off[0]
     assert min(pose.inliers for pose in closed[1][-8:]) > 60
@@ -87,13 +93,20 @@ def left_over(world: Map) -> float:
         keypoints = np.flatnonzero(keyframe.point_ids >= 0)
         seen = observations(keyframe.features, keypoints)
         squares.append(
-            chi_square(keyframe.T_cw, world.positions[keyframe.point_ids[keypoints]], seen, ReprojectionModel(CAMERA))
+            chi_square(
+                keyframe.T_cw,
+                world.positions[keyframe.point_ids[keypoints]],
+                seen,
+                ReprojectionModel(CAMERA),
+            )
         )
     return float(np.minimum(np.concatenate(squares), 10.0).mean())
 
 
 def test_adjusting_everything_brings_displaced_keyframes_back(closed: Run) -> None:
-    """By more than half, and to where what is left over is no larger than before, within a twentieth."""
+    """By more than half, and to where what is left over is no larger than before, within a
+    twentieth.
+    """
     world = copy.deepcopy(closed[0].map)
     adjust_everything(world, ReprojectionModel(CAMERA))
     settled, best = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
@@ -128,19 +141,28 @@ def test_same_views_same_bits(views: list[View], closed: Run) -> None:
 
 
 class TestVerification:
-    """The newest keyframe of the drifting run, which has come back to where the first ones were taken."""
+    """The newest keyframe of the drifting run, which has come back to where the first ones were
+    taken.
+    """
 
     @pytest.fixture
     def pictures(self, views: list[View], drifting: Run) -> dict[int, DepthImage]:
-        return {k.index: make_depth_image(*views[frame(k)], None, CAMERA) for k in drifting[0].map.keyframes}
+        return {
+            k.index: make_depth_image(*views[frame(k)], None, CAMERA)
+            for k in drifting[0].map.keyframes
+        }
 
     def verify(self, tracker: Tracker, pictures: dict[int, DepthImage]) -> Loop | None:
         newest = tracker.map.keyframes[-1]
         there = np.linalg.norm(TRUTH[:, :3, 3] - TRUTH[frame(newest), :3, 3], axis=1)
         old = min(tracker.map.keyframes[:20], key=lambda k: float(there[frame(k)]))
-        return LoopVerifier(tracker.map, ReprojectionModel(CAMERA), np.random.default_rng(0))(newest, old, pictures)
+        return LoopVerifier(tracker.map, ReprojectionModel(CAMERA), np.random.default_rng(0))(
+            newest, old, pictures
+        )
 
-    def test_gives_the_true_motion_not_the_drifted_one(self, drifting: Run, pictures: dict[int, DepthImage]) -> None:
+    def test_gives_the_true_motion_not_the_drifted_one(
+        self, drifting: Run, pictures: dict[int, DepthImage]
+    ) -> None:
         tracker = drifting[0]
         loop = self.verify(tracker, pictures)
         assert loop is not None
@@ -151,9 +173,13 @@ class TestVerification:
             truth = inverse(TRUTH[frame(new)]) @ TRUTH[frame(old)]
             off = np.linalg.norm((T @ inverse(truth))[:3, 3])
             assert off < 0.02
-            assert off < 0.3 * np.linalg.norm((new.T_cw @ inverse(old.T_cw) @ inverse(truth))[:3, 3])
+            assert off < 0.3 * np.linalg.norm(
+                (new.T_cw @ inverse(old.T_cw) @ inverse(truth))[:3, 3]
+            )
 
-    def test_neighbours_that_contradict_refuse_it(self, drifting: Run, pictures: dict[int, DepthImage]) -> None:
+    def test_neighbours_that_contradict_refuse_it(
+        self, drifting: Run, pictures: dict[int, DepthImage]
+    ) -> None:
         keyframes = drifting[0].map.keyframes[-6:-1]
         before = [keyframe.T_cw for keyframe in keyframes]
         for keyframe in keyframes:
@@ -164,7 +190,9 @@ class TestVerification:
             for keyframe, T_cw in zip(keyframes, before, strict=True):
                 keyframe.T_cw = T_cw
 
-    def test_pictures_that_contradict_refuse_it(self, drifting: Run, pictures: dict[int, DepthImage]) -> None:
+    def test_pictures_that_contradict_refuse_it(
+        self, drifting: Run, pictures: dict[int, DepthImage]
+    ) -> None:
         keyframes = drifting[0].map.keyframes
         wrong = pictures | {keyframes[-1].index: pictures[keyframes[len(keyframes) // 2].index]}
         assert self.verify(drifting[0], wrong) is None

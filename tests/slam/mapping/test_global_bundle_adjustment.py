@@ -1,4 +1,6 @@
-"""The adjustment at the end, in which frames between keyframes count: what it is worth, and what it may not do."""
+"""The adjustment at the end, in which frames between keyframes count: what it is worth, and what it
+may not do.
+"""
 
 from collections.abc import Sequence
 
@@ -22,7 +24,9 @@ FRAMES = 30
 PATH = camera_path(FRAMES)
 
 
-def measured(T_wc: NDArray[np.float64], points: NDArray[np.float64], rng: np.random.Generator) -> Features:
+def measured(
+    T_wc: NDArray[np.float64], points: NDArray[np.float64], rng: np.random.Generator
+) -> Features:
     """What a camera sees of points [n, 3] m, to a pixel and 2 % of the depth."""
     local = to_local(inverse(T_wc), points)
     pixels = CAMERA.project(local) + rng.standard_normal((len(points), 2))
@@ -38,12 +42,22 @@ def off_after_adjustment(seed: int, frames_count: bool) -> float:
     for index in range(3):
         T_wc = PATH[10 * index]
         free = np.full(200, -1) if index == 0 else ids
-        keyframe = Keyframe(index, index / 3, inverse(T_wc), measured(T_wc, points, rng), free.copy(), picture, picture)
+        keyframe = Keyframe(
+            index,
+            index / 3,
+            inverse(T_wc),
+            measured(T_wc, points, rng),
+            free.copy(),
+            picture,
+            picture,
+        )
         world.add_keyframe(keyframe)
         if index == 0:
             world.add_points(keyframe, ids)
     sightings = [
-        Sighting(inverse(T_wc), ids, observations(measured(T_wc, points, rng), ids)) for T_wc in PATH if frames_count
+        Sighting(inverse(T_wc), ids, observations(measured(T_wc, points, rng), ids))
+        for T_wc in PATH
+        if frames_count
     ]
     adjust_everything(world, ReprojectionModel(CAMERA), sightings)
     return float(np.sqrt(((world.positions[ids] - points) ** 2).sum(axis=1).mean()))
@@ -77,7 +91,9 @@ def remember(seen: ObservedFrames, row: int, tracker: Tracker) -> None:
         seen.append(row, chosen, tracker.features, tracker.map)
 
 
-def test_memory_is_bounded_and_what_is_kept_lies_evenly(tracker: Tracker, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_bounded_and_what_is_kept_lies_evenly(
+    tracker: Tracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(final_adjustment, "_MOST", 20)
     seen = ObservedFrames()
     for row in range(1000):
@@ -90,14 +106,21 @@ def test_memory_is_bounded_and_what_is_kept_lies_evenly(tracker: Tracker, monkey
     assert rows[-1] > 900, "the latest frames are among them"
 
 
-def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The adjustment is a stand-in that moves keyframes by one motion and frames by another."""
     monkeypatch.setattr(final_adjustment, "_MOST", 10)
     tracker = run()
     kept = [frame.row for frame in tracker._seen._kept]
-    step, further = np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]), np.array([0.0, 0.03, 0.01, 0.0, 0.02, 0.0])
+    step, further = (
+        np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]),
+        np.array([0.0, 0.03, 0.01, 0.0, 0.02, 0.0]),
+    )
 
-    def moves(world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
+    def moves(
+        world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()
+    ) -> NDArray[np.float64]:
         if not sightings:
             world.move(np.stack([k.T_cw for k in world.keyframes]) @ inverse(exp_se3(step)))
         poses = [exp_se3(further) @ sighting.T_cw for sighting in sightings]
@@ -126,7 +149,9 @@ def test_frames_give_all_their_points_between_them(
         remember(seen, row, tracker)
     for kept in seen._kept:
         assert 0.4 * len(points) < len(kept.ids) < 0.6 * len(points)
-    times = np.bincount(np.concatenate([kept.ids for kept in seen._kept]), minlength=tracker.map.size)[points]
+    times = np.bincount(
+        np.concatenate([kept.ids for kept in seen._kept]), minlength=tracker.map.size
+    )[points]
     np.testing.assert_allclose(times, len(seen._kept) / 2, atol=1)
 
 
@@ -164,7 +189,9 @@ def test_a_map_of_one_keyframe_is_left_alone() -> None:
 def test_without_frames_the_keyframes_are_adjusted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker, asked = run(), []
 
-    def counts(world: object, reprojection: object, sightings: Sequence[Sighting] = ()) -> NDArray[np.float64]:
+    def counts(
+        world: object, reprojection: object, sightings: Sequence[Sighting] = ()
+    ) -> NDArray[np.float64]:
         asked.append(len(sightings))
         return np.zeros((0, 4, 4))
 

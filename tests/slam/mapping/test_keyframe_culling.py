@@ -1,4 +1,6 @@
-"""A map that grows with the room, not with time; and what may never be lost when keyframes and points go."""
+"""A map that grows with the room, not with time; and what may never be lost when keyframes and
+points go.
+"""
 
 from copy import deepcopy
 
@@ -10,7 +12,12 @@ from cohdc_train.slam.config import Method
 from cohdc_train.slam.geometry.se3 import Array, exp_se3
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
-from cohdc_train.slam.mapping.local_bundle_adjustment import WINDOW, Solution, close_window, open_window
+from cohdc_train.slam.mapping.local_bundle_adjustment import (
+    WINDOW,
+    Solution,
+    close_window,
+    open_window,
+)
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.patch_refiner import affine
 from cohdc_train.slam.tracking.tracker import Tracker
@@ -23,7 +30,9 @@ PATH = camera_path(60)[::3]
 
 
 def sway(rounds: int, **parts: bool) -> Tracker:
-    """A hand that sways before the room, every second frame a keyframe; the end of each round is its beginning."""
+    """A hand that sways before the room, every second frame a keyframe; the end of each round is
+    its beginning.
+    """
     tracker = Tracker(CAMERA, features=250, method=Method(**parts))
     views = [render(room(), T_wc)[:2] for T_wc in PATH]
     with pytest.MonkeyPatch.context() as patch:
@@ -60,7 +69,9 @@ def test_the_map_of_a_known_room_stops_growing(culled: Tracker, never_culled: Tr
 
 
 def test_patches_are_bounded_with_the_points() -> None:
-    """Refinement keeps one per row of the map; a point whose first keyframe has gone is still refined."""
+    """Refinement keeps one per row of the map; a point whose first keyframe has gone is still
+    refined.
+    """
     tracker = sway(2, refinement=True)
     assert tracker._refiner is not None
     assert tracker.map.joined > len(tracker.map.keyframes)
@@ -70,7 +81,9 @@ def test_patches_are_bounded_with_the_points() -> None:
 
 @pytest.mark.slow
 def test_a_known_place_needs_no_keyframe() -> None:
-    """Twelve keyframes at one place, a hand that then holds still: at 30 frames/s the clock alone would ask for six."""
+    """Twelve keyframes at one place, a hand that then holds still: at 30 frames/s the clock alone
+    would ask for six.
+    """
     rgb, depth, _ = render(room(), PATH[0])
     tracker = Tracker(CAMERA, features=250)
     with pytest.MonkeyPatch.context() as patch:
@@ -80,10 +93,15 @@ def test_a_known_place_needs_no_keyframe() -> None:
             tracker.track(rgb, depth, number / 30)
     later = [tracker.track(rgb, depth, (12 + number) / 30) for number in range(120)]
     assert not any(pose.keyframe for pose in later)
-    views = [render(room(), exp_se3(np.array([0.03 * k, 0.0, 0.0, 0.0, 0.0, 0.0])))[:2] for k in range(30)]
+    views = [
+        render(room(), exp_se3(np.array([0.03 * k, 0.0, 0.0, 0.0, 0.0, 0.0])))[:2]
+        for k in range(30)
+    ]
     aside = [tracker.track(*view, 5 + k / 30) for k, view in enumerate(views)]
     assert all(pose.tracked for pose in aside)
-    assert any(pose.keyframe for pose in aside), "what comes into view beside it is taken into the map"
+    assert any(pose.keyframe for pose in aside), (
+        "what comes into view beside it is taken into the map"
+    )
 
 
 def ate(tracker: Tracker) -> float:
@@ -122,10 +140,16 @@ def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Tracker) ->
     np.testing.assert_array_equal(whole.trajectory()[0], stamps)
     maps, places = affine(world, first_keyframe, T_cw), world.positions[first_keyframe].copy()
     step = exp_se3(np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]))
-    world.move(np.stack([k.T_cw for k in world.keyframes]) @ np.linalg.inv(step))  # as a loop moves it
-    np.testing.assert_allclose(world.positions[first_keyframe], places @ step[:3, :3].T + step[:3, 3], atol=1e-9)
+    world.move(
+        np.stack([k.T_cw for k in world.keyframes]) @ np.linalg.inv(step)
+    )  # as a loop moves it
+    np.testing.assert_allclose(
+        world.positions[first_keyframe], places @ step[:3, :3].T + step[:3, 3], atol=1e-9
+    )
     np.testing.assert_allclose(whole.trajectory()[1], step @ before, atol=1e-9)
-    np.testing.assert_allclose(affine(world, first_keyframe, T_cw @ np.linalg.inv(step)), maps, atol=1e-9)
+    np.testing.assert_allclose(
+        affine(world, first_keyframe, T_cw @ np.linalg.inv(step)), maps, atol=1e-9
+    )
 
 
 def test_some_keyframes_never_go(whole: Tracker) -> None:
@@ -161,4 +185,6 @@ def test_a_window_under_way_moves_no_point_that_took_a_row_meanwhile(whole: Trac
 def keyframe_like(world: Map, keyframe: Keyframe) -> Keyframe:
     """A new one at the same place that sees no point yet."""
     free, pictures = np.full(len(keyframe.features), -1), (keyframe.thumbnail, keyframe.nearest)
-    return Keyframe(world.joined, keyframe.t + 1, keyframe.T_cw.copy(), keyframe.features, free, *pictures)
+    return Keyframe(
+        world.joined, keyframe.t + 1, keyframe.T_cw.copy(), keyframe.features, free, *pictures
+    )

@@ -11,7 +11,9 @@ ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them
 
 
 def keyframe(index: int, point_ids: list[int]) -> Keyframe:
-    """One that looks at a wall 2 m away, a corner for each of four points; -1 where it does not see one."""
+    """One that looks at a wall 2 m away, a corner for each of four points; -1 where it does not see
+    one.
+    """
     pixels = np.array([[100.0, 80.0], [200.0, 80.0], [100.0, 160.0], [200.0, 160.0]])
     features = features_at(pixels, np.full(4, 2.0))
     picture = np.zeros((2, 2), dtype=np.float32)
@@ -19,7 +21,9 @@ def keyframe(index: int, point_ids: list[int]) -> Keyframe:
 
 
 def test_what_a_point_has_become() -> None:
-    """The last of three is taken over by the second, and that by the first; later a new point has the first's row."""
+    """The last of three is taken over by the second, and that by the first; later a new point has
+    the first's row.
+    """
     world = Map(CAMERA)
     frames = [keyframe(index, [-1, -1, -1, -1]) for index in range(4)]
     for index in range(3):
@@ -56,7 +60,10 @@ def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
 def test_dropped_point_leaves_every_keyframe_however_many_saw_it() -> None:
     """A point remembers eight observers; the drop reaches the other four too."""
     world = Map(CAMERA)
-    keyframes = [keyframe(0, [-1, -1, -1, -1]), *(keyframe(index, [0, -1, -1, -1]) for index in range(1, 12))]
+    keyframes = [
+        keyframe(0, [-1, -1, -1, -1]),
+        *(keyframe(index, [0, -1, -1, -1]) for index in range(1, 12)),
+    ]
     world.add_keyframe(keyframes[0])
     world.add_points(keyframes[0], np.array([0]))
     for other in keyframes[1:]:

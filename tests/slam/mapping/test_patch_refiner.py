@@ -18,20 +18,33 @@ from cohdc_train.slam.mapping.keyframe import observations
 from cohdc_train.slam.mapping.patch_refiner import PatchRefiner, affine
 from cohdc_train.slam.tracking.tracker import Tracker
 
-PICTURE = cv2.cvtColor(cv2.GaussianBlur(texture(np.random.default_rng(0), 240, 320), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)
+PICTURE = cv2.cvtColor(
+    cv2.GaussianBlur(texture(np.random.default_rng(0), 240, 320), (0, 0), 1.5), cv2.COLOR_RGB2GRAY
+)
 PYRAMID = Pyramid(np.asarray(PICTURE, dtype=np.uint8))
-CORNERS = OrbExtractor(CAMERA, 150)(cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2RGB), np.ones((240, 320), np.float32))
-INSIDE = ((CORNERS.pixels > 60) & (CORNERS.pixels < (260, 180))).all(axis=1) & (CORNERS.octaves <= 4)
+CORNERS = OrbExtractor(CAMERA, 150)(
+    cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2RGB), np.ones((240, 320), np.float32)
+)
+INSIDE = ((CORNERS.pixels > 60) & (CORNERS.pixels < (260, 180))).all(axis=1) & (
+    CORNERS.octaves <= 4
+)
 
 
 @settings(max_examples=25)
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.7, 1.3), st.floats(-30, 30))
-def test_a_patch_goes_back_to_where_it_was_cut_out(x: float, y: float, gain: float, offset: float) -> None:
+def test_a_patch_goes_back_to_where_it_was_cut_out(
+    x: float, y: float, gain: float, offset: float
+) -> None:
     """Whatever the light: by a tenth of a pixel of its level in the median, and few are misled."""
     pixels, octaves = CORNERS.pixels[INSIDE], CORNERS.octaves[INSIDE]
     template = gain * PYRAMID.cut(pixels, octaves, 10).reshape(-1, 10, 10) + offset
     scale = 1.2**octaves
-    shift, good = align(PYRAMID, pixels + np.array([x, y]) * scale[:, None], octaves, np.asarray(template, np.float32))
+    shift, good = align(
+        PYRAMID,
+        pixels + np.array([x, y]) * scale[:, None],
+        octaves,
+        np.asarray(template, np.float32),
+    )
     assert good.mean() > 0.6
     error = np.linalg.norm(shift[good] + (x, y), axis=1)
     assert np.median(error) < 0.1
@@ -48,8 +61,12 @@ def test_a_blank_patch_and_a_stranger_stay() -> None:
 def test_a_patch_is_turned_and_scaled() -> None:
     ramp = np.broadcast_to(np.arange(16, dtype=np.uint8) * 10, (1, 16, 16))
     quarter = np.array([[[0.0, -1.0], [1.0, 0.0]]])  # x of the patch is minus y of the image
-    np.testing.assert_allclose(warped(ramp, quarter, 8)[0, :, 0], np.arange(110, 30, -10), atol=1e-3)
-    np.testing.assert_allclose(warped(ramp, 0.5 * np.eye(2)[None], 8)[0, 0], 75 + 5 * (np.arange(8) - 3.5), atol=1e-3)
+    np.testing.assert_allclose(
+        warped(ramp, quarter, 8)[0, :, 0], np.arange(110, 30, -10), atol=1e-3
+    )
+    np.testing.assert_allclose(
+        warped(ramp, 0.5 * np.eye(2)[None], 8)[0, 0], 75 + 5 * (np.arange(8) - 3.5), atol=1e-3
+    )
 
 
 @pytest.fixture
@@ -61,12 +78,16 @@ def tracker() -> Tracker:
 
 
 PICTURE_RGB = texture(np.random.default_rng(3), 600, 900)
-WALL = Rectangle(np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 4.0, 0]), PICTURE_RGB)
+WALL = Rectangle(
+    np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 4.0, 0]), PICTURE_RGB
+)
 FIRST_VIEW, FIRST_DEPTH, _ = render([WALL], np.eye(4))
 
 
 def test_the_affine_map_is_the_projections_derivative(tracker: Tracker) -> None:
-    """One pixel to the side in the keyframe, at the point's depth there, and where that lies in the other camera."""
+    """One pixel to the side in the keyframe, at the point's depth there, and where that lies in the
+    other camera.
+    """
     world, T_cw = tracker.map, exp_se3(np.array([0.2, -0.1, 0.3, 0.1, -0.2, 0.4]))
     ids = np.arange(50)
 
@@ -77,7 +98,9 @@ def test_the_affine_map_is_the_projections_derivative(tracker: Tracker) -> None:
     A, tiny = affine(world, ids, T_cw), 1e-4
     for axis in range(2):
         moved = CAMERA.backproject(first + tiny * np.eye(2)[axis], world.positions[ids, 2])
-        np.testing.assert_allclose(A[:, :, axis], (seen(moved) - seen(world.positions[ids])) / tiny, atol=1e-3)
+        np.testing.assert_allclose(
+            A[:, :, axis], (seen(moved) - seen(world.positions[ids])) / tiny, atol=1e-3
+        )
 
 
 def test_what_a_rolling_shutter_moved_stays_moved(tracker: Tracker) -> None:
@@ -102,11 +125,16 @@ def test_what_fits_nowhere_is_not_precise(tracker: Tracker) -> None:
     keypoints = np.flatnonzero(keyframe.point_ids >= 0)
     matches, refiner = Matches(keyframe.point_ids[keypoints], keypoints), tracker._refiner
     assert refiner is not None
-    for picture, least, most in ((FIRST_VIEW, 0.5, 1.0), (np.ascontiguousarray(FIRST_VIEW[::-1]), 0.0, 0.05)):
+    for picture, least, most in (
+        (FIRST_VIEW, 0.5, 1.0),
+        (np.ascontiguousarray(FIRST_VIEW[::-1]), 0.0, 0.05),
+    ):
         refiner.look_at(gray_of(picture))
         found = refiner.refine(keyframe.features, matches, keyframe.T_cw)
         assert least <= found.is_subpixel.mean() <= most
-        np.testing.assert_array_equal(found.pixels[~found.is_subpixel], keyframe.features.pixels[~found.is_subpixel])
+        np.testing.assert_array_equal(
+            found.pixels[~found.is_subpixel], keyframe.features.pixels[~found.is_subpixel]
+        )
 
 
 def test_a_point_without_a_patch_does_not_take_over_a_former_one(tracker: Tracker) -> None:
@@ -128,10 +156,14 @@ def test_a_patch_with_one_edge_is_no_error() -> None:
 
 
 def test_a_place_found_anew_owes_nothing_to_where_it_was_expected() -> None:
-    """A camera at rest that is carried off at once: what it sees, some hundred points, says where it is."""
+    """A camera at rest that is carried off at once: what it sees, some hundred points, says where
+    it is.
+    """
     tracker = Tracker(CAMERA, features=150, method=Method(loops=False, keyframe_culling=False))
     yaws = [*np.linspace(0, 0.55, 28), *([0.55] * 12)]
-    path = [exp_se3(np.array([0, 0, 0, 0, yaw, 0])) for yaw in yaws] + [exp_se3(np.array([0.1, 0, 0, 0, 0.05, 0]))]
+    path = [exp_se3(np.array([0, 0, 0, 0, yaw, 0])) for yaw in yaws] + [
+        exp_se3(np.array([0.1, 0, 0, 0, 0.05, 0]))
+    ]
     poses = [tracker.track(*render(room(), T_wc)[:2], k / 30) for k, T_wc in enumerate(path)]
     assert poses[-1].T_wc is not None
     assert poses[-1].inliers < 150
@@ -139,7 +171,9 @@ def test_a_place_found_anew_owes_nothing_to_where_it_was_expected() -> None:
 
 
 def test_a_map_of_refined_measurements_fits_better() -> None:
-    """Twelve views of a room: what bundle adjustment leaves over, in the median, falls by a fifth and more."""
+    """Twelve views of a room: what bundle adjustment leaves over, in the median, falls by a fifth
+    and more.
+    """
     left = []
     for method in (Method(refinement=False), Method()):
         tracker = Tracker(CAMERA, features=300, method=method)
@@ -148,30 +182,44 @@ def test_a_map_of_refined_measurements_fits_better() -> None:
         errors = []
         for keyframe in tracker.map.keyframes[1:]:
             keypoints = np.flatnonzero(keyframe.point_ids >= 0)
-            keypoints = keypoints[tracker.map.first_keyframe[keyframe.point_ids[keypoints]] < keyframe.index]
+            keypoints = keypoints[
+                tracker.map.first_keyframe[keyframe.point_ids[keypoints]] < keyframe.index
+            ]
             local = to_local(keyframe.T_cw, tracker.map.positions[keyframe.point_ids[keypoints]])
-            errors.append(np.linalg.norm(CAMERA.project(local) - keyframe.features.points[keypoints], axis=1))
+            errors.append(
+                np.linalg.norm(CAMERA.project(local) - keyframe.features.points[keypoints], axis=1)
+            )
         left.append(np.median(np.concatenate(errors)))
     assert left[1] < 0.8 * left[0]
 
 
 def test_frames_are_placed_by_a_fraction_of_the_error() -> None:
-    """Sixty views of a room whose pictures are noisy: half the error of corners on whole pixels, and less."""
+    """Sixty views of a room whose pictures are noisy: half the error of corners on whole pixels,
+    and less.
+    """
     errors = []
     for method in (Method(refinement=False, smoothing=False), Method(smoothing=False)):
-        rng, tracker, path = np.random.default_rng(5), Tracker(CAMERA, features=300, method=method), camera_path(60)
+        rng, tracker, path = (
+            np.random.default_rng(5),
+            Tracker(CAMERA, features=300, method=method),
+            camera_path(60),
+        )
         for k, pose in enumerate(path):
             rgb, depth, _ = render(room(), pose)
             noisy = np.clip(rgb + rng.normal(0, 3, rgb.shape), 0, 255).astype(np.uint8)
             assert tracker.track(noisy, depth, k / 30).tracked
         tracker.finish()
         truth = inverse(path[0]) @ np.stack(path)
-        errors.append(np.sqrt(((tracker.trajectory()[1][:, :3, 3] - truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
+        errors.append(
+            np.sqrt(((tracker.trajectory()[1][:, :3, 3] - truth[:, :3, 3]) ** 2).sum(axis=1).mean())
+        )
     assert errors[1] < 0.5 * errors[0]
 
 
 def test_only_what_a_patch_was_held_against_is_precise(tracker: Tracker) -> None:
-    """Where a point was born its patch lies exactly; a corner that becomes its measurement later may be off."""
+    """Where a point was born its patch lies exactly; a corner that becomes its measurement later
+    may be off.
+    """
     keyframe = tracker.map.keyframes[0]
     points = (keyframe.point_ids >= 0) & (keyframe.features.octaves <= 4)
     assert keyframe.features.is_subpixel[points].all()
@@ -179,7 +227,9 @@ def test_only_what_a_patch_was_held_against_is_precise(tracker: Tracker) -> None
     assert not keyframe.features.is_subpixel[~points].any(), "wide patches are seldom flat"
     measured = observations(keyframe.features, np.arange(len(points)))
     np.testing.assert_array_equal(measured.sigmas, keyframe.features.sigmas)
-    np.testing.assert_array_equal(measured.depth_sigmas, keyframe.features.scales, err_msg="depth is no better known")
+    np.testing.assert_array_equal(
+        measured.depth_sigmas, keyframe.features.scales, err_msg="depth is no better known"
+    )
     others = keyframe.features.without_subpixel
     np.testing.assert_array_equal(
         others.sigmas, keyframe.features.scales, err_msg="of other points nothing more is known"

@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 PATH = camera_path(20)
 
 
-def picture(T_wc: Array, rectangles: list[Rectangle] | None = None, gain: float = 1.0) -> DepthImage:
+def picture(
+    T_wc: Array, rectangles: list[Rectangle] | None = None, gain: float = 1.0
+) -> DepthImage:
     rgb, depth, moving = render(rectangles or room(), T_wc)
     return make_depth_image((rgb * gain).astype(np.uint8), depth, moving, CAMERA)
 
@@ -28,14 +30,21 @@ def test_the_warps_jacobian_equals_differences(seed: int) -> None:
     points = np.random.default_rng(seed).uniform([-1, -0.7, 1], [1, 0.7, 4], size=(5, 3))
     jacobian = warp_jacobian(points, CAMERA)
     for axis in range(6):
-        ends = [CAMERA.project(to_local(exp_se3(sign * 1e-6 * np.eye(6)[axis]), points)) for sign in (1, -1)]
-        np.testing.assert_allclose(jacobian[:, :, axis], (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3)
+        ends = [
+            CAMERA.project(to_local(exp_se3(sign * 1e-6 * np.eye(6)[axis]), points))
+            for sign in (1, -1)
+        ]
+        np.testing.assert_allclose(
+            jacobian[:, :, axis], (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3
+        )
 
 
 @settings(max_examples=8)
 @given(st.integers(0, 1000))
 def test_a_small_motion_is_recovered(seed: int) -> None:
-    off = np.random.default_rng(seed).uniform(-1, 1, 6) * np.repeat([0.03, 0.015], 3)  # 3 cm, 0.9 degrees per axis
+    off = np.random.default_rng(seed).uniform(-1, 1, 6) * np.repeat(
+        [0.03, 0.015], 3
+    )  # 3 cm, 0.9 degrees per axis
     truth = inverse(PATH[19]) @ PATH[0]
     found = align(picture(PATH[0]), picture(PATH[19], gain=0.8), exp_se3(off) @ truth)
     assert found is not None
@@ -51,10 +60,18 @@ def test_a_small_motion_is_recovered(seed: int) -> None:
 def test_the_same_poster_before_another_wall_does_not_correlate() -> None:
     rng = np.random.default_rng(5)
     poster = Rectangle(
-        np.array([-0.5, -0.6, 2.5]), np.array([1.2, 0, 0]), np.array([0, 1.2, 0]), texture(rng, 300, 300)
+        np.array([-0.5, -0.6, 2.5]),
+        np.array([1.2, 0, 0]),
+        np.array([0, 1.2, 0]),
+        texture(rng, 300, 300),
     )
     walls = [
-        Rectangle(np.array([-3.0, -2.0, 2.6]), np.array([6.0, 0, 0]), np.array([0, 4.0, 0]), texture(rng, 800, 1200))
+        Rectangle(
+            np.array([-3.0, -2.0, 2.6]),
+            np.array([6.0, 0, 0]),
+            np.array([0, 4.0, 0]),
+            texture(rng, 800, 1200),
+        )
         for _ in range(2)
     ]
     views = [picture(np.eye(4), [poster, wall]) for wall in walls]
@@ -85,13 +102,20 @@ def test_a_picture_keeps_the_geometry(size: tuple[int, int]) -> None:
     width, height = size
     camera = type(CAMERA)(500.0, 510.0, width / 2 + 7, height / 2 - 3, width, height, 5000.0)
     small = make_depth_image(
-        np.zeros((height, width, 3), dtype=np.uint8), np.ones((height, width), dtype=np.float32), None, camera
+        np.zeros((height, width, 3), dtype=np.uint8),
+        np.ones((height, width), dtype=np.float32),
+        None,
+        camera,
     )
     assert max(small.gray.shape) == 160
-    keypoint = np.array([[width - 0.5, height - 0.5]])  # the image's border, seen along the same ray in both
+    keypoint = np.array(
+        [[width - 0.5, height - 0.5]]
+    )  # the image's border, seen along the same ray in both
     ray = camera.backproject(keypoint, np.ones(1))
     np.testing.assert_allclose(
-        small.camera.project(ray)[0], [small.gray.shape[1] - 0.5, small.gray.shape[0] - 0.5], atol=1e-9
+        small.camera.project(ray)[0],
+        [small.gray.shape[1] - 0.5, small.gray.shape[0] - 0.5],
+        atol=1e-9,
     )
 
 

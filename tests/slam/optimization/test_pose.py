@@ -10,7 +10,12 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from cohdc_train.slam.geometry.se3 import exp_se3, skew, to_local
-from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, local_points, measurement_chi2
+from cohdc_train.slam.optimization.bundle_adjustment import (
+    Problem,
+    adjust,
+    local_points,
+    measurement_chi2,
+)
 from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.ransac import ransac_pose, rigid_transforms
 from cohdc_train.slam.optimization.reprojection import (
@@ -32,11 +37,17 @@ def cloud(rng: np.random.Generator, count: int) -> Array:
     return rng.uniform([-1.0, -0.7, 1.5], [1.0, 0.7, 4.0], size=(count, 3))
 
 
-def observe(T_cw: Array, points: Array, rng: np.random.Generator, noise: float = 0.0) -> Observations:
-    """What the camera measures, a fifth of it without depth; noise in px, and as disparity in depth."""
+def observe(
+    T_cw: Array, points: Array, rng: np.random.Generator, noise: float = 0.0
+) -> Observations:
+    """What the camera measures, a fifth of it without depth; noise in px, and as disparity in
+    depth.
+    """
     local = to_local(T_cw, points)
     pixels = CAMERA.project(local) + rng.normal(size=(len(points), 2)) * noise
-    depths = REPROJECTION.bf / (REPROJECTION.bf / local[:, 2] + rng.normal(size=len(points)) * noise)
+    depths = REPROJECTION.bf / (
+        REPROJECTION.bf / local[:, 2] + rng.normal(size=len(points)) * noise
+    )
     depths[rng.random(len(points)) < 0.2] = np.nan
     sigmas = rng.choice([[1.0, 1.0], [1.2, 1.2], [1.44, 1.44], [0.8, 1.2]], size=len(points)).T
     return Observations(pixels, depths, *sigmas)
@@ -64,12 +75,17 @@ def test_jacobians_equal_differences(seed: int) -> None:
 
     for axis in range(6):
         step = np.eye(6)[axis] * 1e-6
-        change = error(exp_se3(step) @ T_cw, np.zeros(3)) - error(exp_se3(-step) @ T_cw, np.zeros(3))
+        change = error(exp_se3(step) @ T_cw, np.zeros(3)) - error(
+            exp_se3(-step) @ T_cw, np.zeros(3)
+        )
         np.testing.assert_allclose(by_pose[:, :, axis], change / 2e-6, rtol=1e-4, atol=1e-3)
     for axis in range(3):
         step = np.eye(3)[axis] * 1e-6
         np.testing.assert_allclose(
-            by_point[:, :, axis], (error(T_cw, step) - error(T_cw, -step)) / 2e-6, rtol=1e-4, atol=1e-3
+            by_point[:, :, axis],
+            (error(T_cw, step) - error(T_cw, -step)) / 2e-6,
+            rtol=1e-4,
+            atol=1e-3,
         )
 
 
@@ -86,8 +102,12 @@ def test_pose_is_found_and_outliers_are_told() -> None:
 
 def test_a_point_behind_the_camera_is_never_an_inlier() -> None:
     points = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
-    seen = Observations(np.full((2, 2), [CAMERA.cx, CAMERA.cy]), np.full(2, np.nan), np.ones(2), np.ones(2))
-    np.testing.assert_array_equal(chi_square(np.eye(4), points, seen, REPROJECTION) < CHI2_DEPTH, [False, True])
+    seen = Observations(
+        np.full((2, 2), [CAMERA.cx, CAMERA.cy]), np.full(2, np.nan), np.ones(2), np.ones(2)
+    )
+    np.testing.assert_array_equal(
+        chi_square(np.eye(4), points, seen, REPROJECTION) < CHI2_DEPTH, [False, True]
+    )
 
 
 @given(st.integers(0, 10_000))
@@ -122,7 +142,9 @@ def test_ransac_without_depth_falls_back_on_the_guess() -> None:
 
 
 def small_problem(seed: int, outliers: int = 0) -> tuple[Array, Array, Array, Array, Problem]:
-    """Five cameras, two of them fixed, 40 points. Returns true poses and points, disturbed ones, and the problem."""
+    """Five cameras, two of them fixed, 40 points. Returns true poses and points, disturbed ones,
+    and the problem.
+    """
     rng = np.random.default_rng(seed)
     poses, points = exp_se3(rng.normal(size=(5, 6)) * 0.08), cloud(rng, 40)
     rows = [np.sort(rng.permutation(40)[:30]) for _ in poses]
@@ -150,10 +172,14 @@ def test_schur_bundle_adjustment_equals_a_general_solver() -> None:
         local = local_points(moved, x[18:].reshape(-1, 3), problem)
         return residuals(local, problem.seen, REPROJECTION).reshape(-1)
 
-    expected = least_squares(error, np.r_[np.zeros(18), points.reshape(-1)], method="lm", xtol=1e-14, ftol=1e-14)
+    expected = least_squares(
+        error, np.r_[np.zeros(18), points.reshape(-1)], method="lm", xtol=1e-14, ftol=1e-14
+    )
     got_poses, got_points = poses, points
     for _ in range(4):  # it stops when a step gains less than a thousandth
-        got_poses, got_points = adjust(got_poses, got_points, problem, REPROJECTION, steps=20, robust=False)
+        got_poses, got_points = adjust(
+            got_poses, got_points, problem, REPROJECTION, steps=20, robust=False
+        )
     cost = measurement_chi2(got_poses, got_points, problem, REPROJECTION).sum()
     assert cost == pytest.approx(2 * expected.cost, rel=1e-6)
     wanted = exp_se3(expected.x[:18].reshape(3, 6)) @ poses[problem.free]
@@ -167,7 +193,9 @@ def test_bundle_adjustment_tells_outliers_and_leaves_fixed_poses() -> None:
     good = measurement_chi2(new_poses, new_points, problem, REPROJECTION) <= problem.seen.limits
     assert not good[:6].any()
     assert good[6:].all()
-    new_poses, _ = adjust(new_poses, new_points, problem.take(good), REPROJECTION, steps=20, robust=False)
+    new_poses, _ = adjust(
+        new_poses, new_points, problem.take(good), REPROJECTION, steps=20, robust=False
+    )
     np.testing.assert_array_equal(new_poses[:2], poses[:2])
     before = np.linalg.norm(poses[2:, :3, 3] - true_poses[2:, :3, 3], axis=1)
     after = np.linalg.norm(new_poses[2:, :3, 3] - true_poses[2:, :3, 3], axis=1)

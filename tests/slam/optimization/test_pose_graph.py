@@ -8,7 +8,12 @@ from numpy.typing import NDArray
 from scipy.linalg import logm
 
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, log_se3
-from cohdc_train.slam.optimization.pose_graph import Edges, edge_errors, edge_jacobians, optimize_graph
+from cohdc_train.slam.optimization.pose_graph import (
+    Edges,
+    edge_errors,
+    edge_jacobians,
+    optimize_graph,
+)
 
 Array = NDArray[np.float64]
 SIGMA = np.array([0.01, 0.003])  # m, rad of every edge
@@ -19,7 +24,9 @@ def noisy(T: Array, rng: np.random.Generator) -> Array:
 
 
 def square(per_side: int = 12, laps: int = 2, step: float = 0.5) -> Array:
-    """[n, 4, 4] T_cw of a camera that walks round a square, turning its view by 90 degrees along each side."""
+    """[n, 4, 4] T_cw of a camera that walks round a square, turning its view by 90 degrees along
+    each side.
+    """
     motion = exp_se3(np.array([0.0, 0.0, -step, 0.0, -np.pi / 2 / per_side, 0.0]))
     poses = [np.eye(4)]
     for _ in range(4 * per_side * laps - 1):
@@ -27,7 +34,9 @@ def square(per_side: int = 12, laps: int = 2, step: float = 0.5) -> Array:
     return np.stack(poses)
 
 
-def graph(truth: Array, rng: np.random.Generator, loops: list[tuple[int, int]]) -> tuple[Array, Edges]:
+def graph(
+    truth: Array, rng: np.random.Generator, loops: list[tuple[int, int]]
+) -> tuple[Array, Edges]:
     """Poses that drifted along noisy odometry, and its edges with those of the loops behind them."""
     first = np.r_[np.arange(len(truth) - 1), [a for a, _ in loops]].astype(np.int64)
     second = np.r_[np.arange(1, len(truth)), [b for _, b in loops]].astype(np.int64)
@@ -35,7 +44,9 @@ def graph(truth: Array, rng: np.random.Generator, loops: list[tuple[int, int]]) 
     drifted = [truth[0]]
     for motion in T[: len(truth) - 1]:
         drifted.append(motion @ drifted[-1])
-    edges = Edges(first, second, T, np.tile(SIGMA, (len(T), 1)), np.arange(len(T)) >= len(truth) - 1)
+    edges = Edges(
+        first, second, T, np.tile(SIGMA, (len(T), 1)), np.arange(len(T)) >= len(truth) - 1
+    )
     return np.stack(drifted), edges
 
 
@@ -75,7 +86,9 @@ def test_jacobians_equal_differences(seed: int) -> None:
             for side, sign in zip(moved, (1, -1), strict=True):
                 side[node] = exp_se3(sign * 1e-5 * np.eye(6)[axis]) @ side[node]
             difference = (edge_errors(moved[0], edges) - edge_errors(moved[1], edges))[0] / 2e-5
-            np.testing.assert_allclose(jacobian[0, :, axis], difference, atol=2e-2 * np.abs(jacobian).max())
+            np.testing.assert_allclose(
+                jacobian[0, :, axis], difference, atol=2e-2 * np.abs(jacobian).max()
+            )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -85,7 +98,11 @@ def test_loops_take_out_the_drift(seed: int) -> None:
     solved, weights = optimize_graph(drifted, edges)
     # What is left is the noise of one lap; two laps without a loop carry much more.
     exact = Edges(
-        edges.first, edges.second, truth[edges.second] @ inverse(truth[edges.first]), edges.sigmas, edges.robust
+        edges.first,
+        edges.second,
+        truth[edges.second] @ inverse(truth[edges.first]),
+        edges.sigmas,
+        edges.robust,
     )
     assert error(optimize_graph(drifted, exact)[0], truth) < 1e-3 * error(drifted, truth)
     assert error(solved, truth) < 0.5 * error(drifted, truth)

@@ -15,8 +15,11 @@ from cohdc_train.slam.tracking.motion_model import ACCELERATION
 from cohdc_train.slam.tracking.tracker import Tracker
 
 
-def noisy(seed: int, frames: int, sigma: float, pace: float = 0.25) -> tuple[Array, Array, Array, Array]:
-    """stamps, true T_cw, measured T_cw off by sigma m and rad in every direction, and their information.
+def noisy(
+    seed: int, frames: int, sigma: float, pace: float = 0.25
+) -> tuple[Array, Array, Array, Array]:
+    """stamps, true T_cw, measured T_cw off by sigma m and rad in every direction, and their
+    information.
 
     pace: of the swaying hand; at .25 it speeds up by .2 m/s^2, at 1 by 2.5.
     """
@@ -72,7 +75,9 @@ def test_it_is_the_least_squares_of_what_was_seen_and_of_changes_of_velocity(see
         ahead, behind = (log_se3(measured[k + 1] @ inverse(measured[k])) for k in (i, i - 1))
         rows.append(row)
         right.append(-(ahead / b - behind / a) / deviation)
-    small = np.linalg.lstsq(np.concatenate(rows).reshape(-1, 6 * n), np.concatenate(right), rcond=None)[0]
+    small = np.linalg.lstsq(
+        np.concatenate(rows).reshape(-1, 6 * n), np.concatenate(right), rcond=None
+    )[0]
     wanted = exp_se3(small.reshape(n, 6)) @ measured
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(smoothing, "_ROUNDS", 1)  # the first, in which all changes weigh alike
@@ -91,7 +96,9 @@ def test_a_knock_is_rounded_off_for_a_moment_only() -> None:
 
 
 @given(st.integers(0, 10_000), st.floats(3.0, 20.0), st.floats(1.0, 2.0))
-def test_frames_that_know_more_than_they_say_are_believed(seed: int, modesty: float, pace: float) -> None:
+def test_frames_that_know_more_than_they_say_are_believed(
+    seed: int, modesty: float, pace: float
+) -> None:
     """Before a shaken camera; otherwise they would be smoothed away."""
     stamps, truth, measured, information = noisy(seed, 90, 0.003, pace)
     assert off(alone(stamps, measured, information / modesty**2), truth) < off(measured, truth)
@@ -115,14 +122,21 @@ def test_the_world_may_lie_anywhere() -> None:
     stamps, _, measured, information = noisy(1, 30, 0.005)
     world = exp_se3(np.array([1.0, -2.0, 3.0, 0.4, 0.5, -0.6]))
     once = alone(stamps, measured, information)
-    np.testing.assert_allclose(alone(stamps, measured @ world, information), once @ world, atol=1e-9)
+    np.testing.assert_allclose(
+        alone(stamps, measured @ world, information), once @ world, atol=1e-9
+    )
 
 
 def test_frames_on_both_sides_of_a_gap_know_nothing_of_each_other() -> None:
     stamps, _, measured, information = noisy(2, 40, 0.005)
     stamps[20:] += 1.0
-    apart = [alone(stamps[part], measured[part], information[part]) for part in (slice(0, 20), slice(20, 40))]
-    np.testing.assert_allclose(alone(stamps, measured, information), np.concatenate(apart), atol=1e-12)
+    apart = [
+        alone(stamps[part], measured[part], information[part])
+        for part in (slice(0, 20), slice(20, 40))
+    ]
+    np.testing.assert_allclose(
+        alone(stamps, measured, information), np.concatenate(apart), atol=1e-12
+    )
 
 
 def test_nor_does_one_side_tell_how_calm_the_other_is() -> None:
@@ -130,7 +144,9 @@ def test_nor_does_one_side_tell_how_calm_the_other_is() -> None:
     measured[:20] = noisy(5, 20, 0.03)[2]
     stamps[20:] += 1.0
     np.testing.assert_allclose(
-        alone(stamps, measured, information)[20:], alone(stamps[20:], measured[20:], information[20:]), atol=1e-12
+        alone(stamps, measured, information)[20:],
+        alone(stamps[20:], measured[20:], information[20:]),
+        atol=1e-12,
     )
 
 
@@ -145,7 +161,9 @@ def test_frames_that_saw_nothing_are_no_fault(step: float) -> None:
 def test_few_frames_stay(frames: int) -> None:
     stamps, _, measured, information = noisy(3, 3, 0.01)
     kept = slice(0, frames)
-    np.testing.assert_array_equal(alone(stamps[kept], measured[kept], information[kept]), measured[kept])
+    np.testing.assert_array_equal(
+        alone(stamps[kept], measured[kept], information[kept]), measured[kept]
+    )
 
 
 def test_the_tracker_smooths_its_trajectory_unless_told_not_to() -> None:

@@ -28,8 +28,12 @@ def square(frame: int) -> NDArray[np.bool_]:
 
 
 @pytest.mark.parametrize(("late", "made_of"), [(0, range(8)), (2, [0, 0, 0, 1, 1, 3, 3, 5])])
-def test_a_mask_is_of_the_latest_frame_that_is_done(tool: ModuleType, late: int, made_of: list[int]) -> None:
-    """The picture stands still, so that a mask stays where it was made. The segmenter takes the next that comes."""
+def test_a_mask_is_of_the_latest_frame_that_is_done(
+    tool: ModuleType, late: int, made_of: list[int]
+) -> None:
+    """The picture stands still, so that a mask stays where it was made. The segmenter takes the
+    next that comes.
+    """
     gray = np.random.default_rng(0).integers(0, 255, (240, 640, 1)).astype(np.uint8)
     rgb, depth = gray.repeat(3, axis=2), np.full((240, 640), 2.0, dtype=np.float32)
     masks = tool.LateMasks(lambda view: (square(int(view.name)), 0.0), late)
@@ -42,14 +46,30 @@ def test_without_flow_and_in_time_it_is_the_synchronous_run(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = write_sequence(tmp_path / "plane", 12, with_passer_by=True)
-    words = ["--sequences", str(sequence), "--out", str(tmp_path / "out"), "--features", "400", "--late", "0", "2"]
+    words = [
+        "--sequences",
+        str(sequence),
+        "--out",
+        str(tmp_path / "out"),
+        "--features",
+        "400",
+        "--late",
+        "0",
+        "2",
+    ]
     monkeypatch.setattr(sys, "argv", ["late_masks", *words, "--method", "flow=false"])
     tool.main()
     rows = json.loads((tmp_path / "out" / "late_masks.json").read_text())
-    assert [(row["sequence"], row["late"], row["features"]) for row in rows] == [("plane", 0, 400), ("plane", 2, 400)]
+    assert [(row["sequence"], row["late"], row["features"]) for row in rows] == [
+        ("plane", 0, 400),
+        ("plane", 2, 400),
+    ]
     run = slam(sequence=sequence, out=tmp_path / "run", masks=sequence / "masks", features=400)
     assert rows[0]["ate_m"] == pytest.approx(run["ate_m"]["rmse"], rel=1e-3)
-    assert f"| plane | 0 | {rows[0]['ate_m']:.4f} |" in (tmp_path / "out" / "late_masks.md").read_text()
+    assert (
+        f"| plane | 0 | {rows[0]['ate_m']:.4f} |"
+        in (tmp_path / "out" / "late_masks.md").read_text()
+    )
 
 
 @pytest.mark.parametrize("gone", ["groundtruth.txt", "rgb.txt"])
@@ -57,7 +77,9 @@ def test_a_sequence_that_cannot_be_used_is_one_line(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: str
 ) -> None:
     (write_sequence(tmp_path / "plane", 4) / gone).unlink()
-    monkeypatch.setattr(sys, "argv", ["late_masks", "--sequences", str(tmp_path / "plane"), "--out", str(tmp_path)])
+    monkeypatch.setattr(
+        sys, "argv", ["late_masks", "--sequences", str(tmp_path / "plane"), "--out", str(tmp_path)]
+    )
     with pytest.raises(SystemExit, match=gone) as stopped:
         tool.main()
     assert "\n" not in str(stopped.value)

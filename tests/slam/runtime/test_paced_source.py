@@ -1,4 +1,6 @@
-"""Views at the pace of their stamps, without a clock: what is late is dropped and counted, nothing queues."""
+"""Views at the pace of their stamps, without a clock: what is late is dropped and counted, nothing
+queues.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -38,7 +40,13 @@ def test_a_slot_closed_with_an_error_raises_it_where_it_is_read() -> None:
 
 def view(index: int) -> View:
     t, size = 100 + index / 30, (CAMERA.height, CAMERA.width)
-    return View(t, f"{t:.6f}", f"{index}", np.zeros((*size, 3), dtype=np.uint8), np.zeros(size, dtype=np.float32))
+    return View(
+        t,
+        f"{t:.6f}",
+        f"{index}",
+        np.zeros((*size, 3), dtype=np.uint8),
+        np.zeros(size, dtype=np.float32),
+    )
 
 
 class Gated:
@@ -105,7 +113,9 @@ def test_an_answer_ends_the_latency_and_the_time_until_the_next_view_is_spent() 
                     spent.append(paced.spent())
                 source.allowed.release()
     np.testing.assert_allclose(spent, [0.45, 0.55])
-    np.testing.assert_allclose(paced.latencies, [-1 / 30, 0.2 / 30], atol=1e-9)  # the clock stood still for the first
+    np.testing.assert_allclose(
+        paced.latencies, [-1 / 30, 0.2 / 30], atol=1e-9
+    )  # the clock stood still for the first
 
 
 def test_views_that_come_while_the_tracker_is_busy_are_dropped_and_counted() -> None:

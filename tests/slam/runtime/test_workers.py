@@ -38,7 +38,13 @@ def view(index: int, rgb: np.ndarray | None = None, depth: np.ndarray | None = N
     nothing = np.zeros((CAMERA.height, CAMERA.width), dtype=np.float32)
     black = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
     t = 100 + index / 30
-    return View(t, f"{t:.6f}", f"{index}", black if rgb is None else rgb, nothing if depth is None else depth)
+    return View(
+        t,
+        f"{t:.6f}",
+        f"{index}",
+        black if rgb is None else rgb,
+        nothing if depth is None else depth,
+    )
 
 
 class Segmenter:
@@ -134,9 +140,13 @@ FRAMES, DELAY = 40, 5
 
 
 def run_late() -> tuple[Tracker, list[bool], list[float]]:
-    """A passer-by whose masks come DELAY frames late, and bundle adjustment that comes four frames late."""
+    """A passer-by whose masks come DELAY frames late, and bundle adjustment that comes four frames
+    late.
+    """
     worlds = [[*room(), passer_by(index)] for index in range(FRAMES)]
-    rendered = [render(world, T_wc) for world, T_wc in zip(worlds, camera_path(FRAMES), strict=True)]
+    rendered = [
+        render(world, T_wc) for world, T_wc in zip(worlds, camera_path(FRAMES), strict=True)
+    ]
     segmenter = Segmenter(lambda view: rendered[int(view.name)][2])
     tracker = Tracker(CAMERA, features=500, method=Method(global_adjustment=False), executor=Late())
     tracked, overlaps = [], []
@@ -188,25 +198,33 @@ def test_what_joined_the_map_during_an_adjustment_moves_along() -> None:
     good = np.ones(len(window.keypoints), dtype=np.bool_)
     good[-30:] = False
     before = np.count_nonzero(newest.point_ids >= 0)
-    motion = close_window(world, window, Solution(step @ np.stack(window.poses), window.points + 0.01, good))
+    motion = close_window(
+        world, window, Solution(step @ np.stack(window.poses), window.points + 0.01, good)
+    )
     assert motion is not None
     np.testing.assert_allclose(newest.T_cw, step @ window.poses[-1])
     np.testing.assert_allclose(later.T_cw @ np.linalg.inv(newest.T_cw), between, atol=1e-9)
     np.testing.assert_allclose(to_local(later.T_cw, world.positions[added]), seen, atol=1e-9)
-    assert np.count_nonzero(newest.point_ids >= 0) == before - 30, "measurements that do not fit are forgotten"
-    assert close_window(world, window, Solution(np.stack(window.poses), window.points, good)) is None, (
-        "a solution for poses that somebody else has moved since is of no use"
+    assert np.count_nonzero(newest.point_ids >= 0) == before - 30, (
+        "measurements that do not fit are forgotten"
     )
+    assert (
+        close_window(world, window, Solution(np.stack(window.poses), window.points, good)) is None
+    ), "a solution for poses that somebody else has moved since is of no use"
     np.testing.assert_allclose(newest.T_cw, step @ window.poses[-1])
 
 
 def test_a_terminals_ctrl_c_does_not_end_the_worker() -> None:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have us ignore it
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell may have us ignore it
     try:
         with worker_process() as executor:
             os.kill(executor.submit(os.getpid).result(), signal.SIGINT)
             time.sleep(0.2)
-            assert executor.submit(pow, 2, 3).result() == 8, "what is left of the map is still adjusted"
+            assert executor.submit(pow, 2, 3).result() == 8, (
+                "what is left of the map is still adjusted"
+            )
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -220,7 +238,16 @@ def test_the_workers_linear_algebra_has_one_thread(monkeypatch: pytest.MonkeyPat
 
 def test_the_command_in_real_time_accounts_for_every_frame(tmp_path: Path) -> None:
     root, out = write_sequence(tmp_path / "walk", 24, with_passer_by=True), tmp_path / "out"
-    arguments = ["slam", "--sequence", str(root), "--out", str(out), "--masks", str(root / "masks"), "--realtime"]
+    arguments = [
+        "slam",
+        "--sequence",
+        str(root),
+        "--out",
+        str(out),
+        "--masks",
+        str(root / "masks"),
+        "--realtime",
+    ]
     assert main([*arguments, "--features", "500"]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     with (out / "frames.csv").open() as file:

@@ -38,7 +38,9 @@ class Watched:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, flow: bool = True) -> None:
         method = Method(flow=flow, global_adjustment=False, smoothing=False)
         self.spent = 0.0
-        self.tracker = Tracker(CAMERA, 500, method=method, executor=SynchronousExecutor(), spent=lambda: self.spent)
+        self.tracker = Tracker(
+            CAMERA, 500, method=method, executor=SynchronousExecutor(), spent=lambda: self.spent
+        )
         self.searched: list[int] = []
         self.poses: list[Pose] = []
         find = self.tracker._extract.find
@@ -68,7 +70,9 @@ def test_two_of_three_frames_need_no_corners_and_are_as_exact(
         matched.track(view)
         features = flow.tracker.features
         assert features is not None
-        assert len(flow.poses) < 3 or features.is_subpixel.mean() > 0.3, "what a patch told is carried along"
+        assert len(flow.poses) < 3 or features.is_subpixel.mean() > 0.3, (
+            "what a patch told is carried along"
+        )
     assert matched.searched == list(range(FRAMES))
     assert flow.searched == list(range(0, FRAMES, 3))
     assert all(pose.tracked for pose in flow.poses)
@@ -116,7 +120,9 @@ def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
     for view in views[1:14]:
         assert run.track(view).tracked
     assert run.searched == [0, 6, 12]
-    assert worked == [6, 12], "in place of a keyframe, which waits until all is done for the one before"
+    assert worked == [6, 12], (
+        "in place of a keyframe, which waits until all is done for the one before"
+    )
     assert [pose.keyframe for pose in run.poses] == [True] + [False] * 13
     run.spent = 0.0
     for view in views[14:20]:
@@ -147,7 +153,9 @@ def test_a_keyframes_upkeep_is_done_in_parts_while_flow_tracks(
     assert not run.tracker._mapping._parts
 
 
-def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become(views: list[View]) -> None:
+def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become(
+    views: list[View],
+) -> None:
     flow, tracker = begun(views[0])
     first = flow.follow(views[0][0], None, np.eye(4))
     assert first is not None
@@ -176,7 +184,9 @@ def test_of_many_points_a_frame_follows_every_second_and_the_next_the_others(
     assert 0.8 < len(some.ids) / len(others.ids) < 1.25
 
 
-def test_the_same_frames_give_the_same_bits(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_frames_give_the_same_bits(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
     ways = []
     for _ in range(2):
         run = Watched(monkeypatch)
@@ -191,7 +201,9 @@ def test_flow_belongs_to_real_time() -> None:
     assert Tracker(CAMERA, 500, executor=SynchronousExecutor())._flow is not None
 
 
-def test_where_flow_finds_too_little_the_frame_is_matched(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_flow_finds_too_little_the_frame_is_matched(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A leap of ten frames lies beyond what flow can reach, but not beyond the map's."""
     run = Watched(monkeypatch)
     for view in views[:4]:
@@ -205,10 +217,15 @@ def test_where_flow_finds_too_little_the_frame_is_matched(views: list[View], mon
     np.testing.assert_allclose(found[:3, 3], relative[:3, 3], atol=0.01)
 
 
-def test_a_lost_place_is_followed_by_no_flow(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_place_is_followed_by_no_flow(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = Watched(monkeypatch)
     nothing = np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]
-    states = [run.track(nothing if index in (4, 5) else view).tracked for index, view in enumerate(views[:9])]
+    states = [
+        run.track(nothing if index in (4, 5) else view).tracked
+        for index, view in enumerate(views[:9])
+    ]
     assert states == [True] * 4 + [False] * 2 + [True] * 3
     assert run.searched[:5] == [0, 3, 4, 5, 6]
 
@@ -260,7 +277,9 @@ def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
     assert flow.locate(followed, replace(features, points=shifted), STILL) is None
 
 
-@pytest.mark.parametrize(("found", "answers", "over"), [(0.7, True, False), (0.5, True, True), (0.3, False, True)])
+@pytest.mark.parametrize(
+    ("found", "answers", "over"), [(0.7, True, False), (0.5, True, True), (0.3, False, True)]
+)
 def test_a_frame_in_which_flow_loses_many_points_is_matched_after_the_answer(
     views: list[View], found: float, answers: bool, over: bool
 ) -> None:
@@ -286,7 +305,9 @@ def test_no_flow_sets_out_from_a_frame_without_a_pose(views: list[View]) -> None
 
 
 def test_what_is_at_rest_under_its_mask_is_followed_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of a still room is called a person, who after two seconds is taken to be seated: frames 70 and later."""
+    """Most of a still room is called a person, who after two seconds is taken to be seated: frames
+    70 and later.
+    """
     run, mask = Watched(monkeypatch), np.zeros((240, 320), dtype=np.bool_)
     mask[:, :230] = True
     view = render(room(), np.eye(4))
@@ -331,9 +352,13 @@ def test_the_motion_moves_along_with_the_map_and_ends_with_a_loss(
     tracker = run.tracker
     assert tracker._last is not None
     before = tracker._last.T_cw
-    tracker._let(lambda: tracker.map.move(np.stack([k.T_cw @ shift for k in tracker.map.keyframes])))
+    tracker._let(
+        lambda: tracker.map.move(np.stack([k.T_cw @ shift for k in tracker.map.keyframes]))
+    )
     np.testing.assert_allclose(tracker._last.T_cw, before @ shift)
-    np.testing.assert_allclose(tracker._motion.expected(5 / 30).prior.T_cw, before @ shift, atol=0.01)
+    np.testing.assert_allclose(
+        tracker._motion.expected(5 / 30).prior.T_cw, before @ shift, atol=0.01
+    )
     run.track((np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]))
     run.track((np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]))
     assert not run.poses[-1].tracked

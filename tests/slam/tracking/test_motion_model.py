@@ -62,7 +62,10 @@ def test_nothing_is_known_before_two_frames_nor_after_a_loss() -> None:
 
 
 def test_the_motion_goes_along_when_the_map_moves() -> None:
-    motion, shift = moved([k * STEP for k in range(12)]), exp_se3(np.array([0.5, 0.1, -0.3, 0.2, -0.4, 0.3]))
+    motion, shift = (
+        moved([k * STEP for k in range(12)]),
+        exp_se3(np.array([0.5, 0.1, -0.3, 0.2, -0.4, 0.3])),
+    )
     before = motion.expected(12 * STEP).prior
     motion.carry(shift)
     after = motion.expected(12 * STEP).prior
@@ -96,7 +99,9 @@ def test_two_frames_of_one_stamp_leave_all_numbers_finite() -> None:
         motion.found(11 * STEP, exp_se3(np.array([leap, 0, 0, 0, 0, 0])) @ at(11 * STEP), SURE)
         assert motion.twist is None
         assert np.isfinite(motion.expected(11 * STEP).prior.information).all()
-        np.testing.assert_allclose(motion.expected(12 * STEP).prior.T_cw[:3, 3], motion._T_cw[:3, 3], atol=0.03)
+        np.testing.assert_allclose(
+            motion.expected(12 * STEP).prior.T_cw[:3, 3], motion._T_cw[:3, 3], atol=0.03
+        )
 
 
 def test_a_clock_that_leaps_breaks_nothing() -> None:
@@ -110,12 +115,16 @@ def test_a_clock_that_leaps_breaks_nothing() -> None:
 
 
 def test_a_shaken_camera_is_not_held_to_what_was_expected() -> None:
-    """A steady one is, in frames that see little; and one that was shaken, again half a second after a leap."""
+    """A steady one is, in frames that see little; and one that was shaken, again half a second
+    after a leap.
+    """
     motion = moved([k * STEP for k in range(12)])
     assert motion.expected(12 * STEP).given(100) is not None
     assert motion.expected(12 * STEP).given(1000) is None
     for k in range(12, 20):
-        motion.found(k * STEP, exp_se3(np.array([0.01 * (-1) ** k, 0, 0, 0, 0, 0])) @ at(k * STEP), SURE)
+        motion.found(
+            k * STEP, exp_se3(np.array([0.01 * (-1) ** k, 0, 0, 0, 0, 0])) @ at(k * STEP), SURE
+        )
     assert motion.expected(20 * STEP).given(100) is None
     motion.found(20 * STEP, exp_se3(np.array([2.0, 0, 0, 0, 0, 0])) @ at(20 * STEP), SURE)
     for k in range(21, 36):
@@ -124,7 +133,9 @@ def test_a_shaken_camera_is_not_held_to_what_was_expected() -> None:
 
 
 def test_errors_are_as_large_as_foreseen() -> None:
-    """Cameras shoved at random, seen with noise: squared distances in sigmas from what was expected average 6."""
+    """Cameras shoved at random, seen with noise: squared distances in sigmas from what was expected
+    average 6.
+    """
     rng, squares = np.random.default_rng(0), []
     for _ in range(40):
         motion, T_cw, velocity = MotionModel(), np.eye(4), rng.normal(0, 0.3, 6)
@@ -140,13 +151,17 @@ def test_errors_are_as_large_as_foreseen() -> None:
 
 
 def world(count: int, spread: float) -> tuple[NDArray[np.float64], Observations]:
-    """Points 2 to 3 m before a camera at the origin, all within `spread` px of each other, measured with 1 px."""
+    """Points 2 to 3 m before a camera at the origin, all within `spread` px of each other, measured
+    with 1 px.
+    """
     rng = np.random.default_rng(1)
     pixels = np.array([40.0, 40.0]) + rng.uniform(0, spread, (count, 2))
     depths = rng.uniform(2, 3, count)
     points = CAMERA.backproject(pixels, depths)
     noisy = pixels + rng.normal(0, 1, pixels.shape)
-    return points, Observations(noisy, depths * (1 + rng.normal(0, 0.02, count)), np.ones(count), np.ones(count))
+    return points, Observations(
+        noisy, depths * (1 + rng.normal(0, 0.02, count)), np.ones(count), np.ones(count)
+    )
 
 
 def test_an_expectation_decides_where_little_is_seen_and_only_there() -> None:
@@ -162,7 +177,9 @@ def test_an_expectation_decides_where_little_is_seen_and_only_there() -> None:
     elsewhere = Prior(exp_se3(np.array([0.01, 0, 0, 0, 0, 0])), expected.information)
     points, seen = world(2000, 200.0)
     pulled, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA), prior=elsewhere)
-    assert np.linalg.norm(pulled[:3, 3]) < 0.004, "what is seen outweighs an expectation that lies 1 cm off"
+    assert np.linalg.norm(pulled[:3, 3]) < 0.004, (
+        "what is seen outweighs an expectation that lies 1 cm off"
+    )
 
 
 def test_the_pull_is_the_gradient_of_the_squared_distance() -> None:
@@ -177,7 +194,9 @@ def test_the_pull_is_the_gradient_of_the_squared_distance() -> None:
 
     step = 1e-6
     numeric = [(half_square(step * e) - half_square(-step * e)) / (2 * step) for e in np.eye(6)]
-    np.testing.assert_allclose(prior.pull(T_cw), numeric, rtol=0.01, atol=0.01 * np.abs(numeric).max())
+    np.testing.assert_allclose(
+        prior.pull(T_cw), numeric, rtol=0.01, atol=0.01 * np.abs(numeric).max()
+    )
 
 
 def test_information_says_how_poses_scatter() -> None:
@@ -188,14 +207,18 @@ def test_information_says_how_poses_scatter() -> None:
     steps = []
     for _ in range(300):
         disparity = true.bf / depths + rng.normal(0, 1, 60)
-        seen = Observations(pixels + rng.normal(0, 1, (60, 2)), true.bf / disparity, np.ones(60), np.ones(60))
+        seen = Observations(
+            pixels + rng.normal(0, 1, (60, 2)), true.bf / disparity, np.ones(60), np.ones(60)
+        )
         steps.append(log_se3(optimize_pose(np.eye(4), points, seen, true)[0]))
     exact = Observations(pixels, depths, np.ones(60), np.ones(60))
     foreseen = np.sqrt(np.diag(np.linalg.inv(pose_information(np.eye(4), points, exact, true))))
     np.testing.assert_allclose(np.std(steps, axis=0), foreseen, rtol=0.2)
 
 
-def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_sees_a_corner_of_the_room_does_not_leap(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     path = np.concatenate([camera_path(1, later=k / 4) for k in range(60)])  # a calm hand: .2 m/s^2
     views = [render(room(), T_wc) for T_wc in path]
     almost_all = np.ones((240, 320), dtype=np.bool_)

@@ -37,7 +37,9 @@ def views() -> list[View]:
 
 def run(views: list[View], seed: int = 0) -> tuple[Tracker, list[Pose]]:
     tracker = Tracker(CAMERA, features=500, seed=seed)
-    return tracker, [tracker.track(rgb, depth, index / 30) for index, (rgb, depth, _) in enumerate(views)]
+    return tracker, [
+        tracker.track(rgb, depth, index / 30) for index, (rgb, depth, _) in enumerate(views)
+    ]
 
 
 def test_every_frame_of_a_still_room_is_tracked_to_millimetres(views: list[View]) -> None:
@@ -61,17 +63,23 @@ def test_the_place_is_found_again_after_a_black_out(views: list[View]) -> None:
         states.append(tracker.track(rgb, depth, index / 30).tracked)
     assert all(states[:15])
     assert not any(states[15:22])
-    assert all(states[22:]), "the camera moved on by seven frames in the dark and must still be found"
+    assert all(states[22:]), (
+        "the camera moved on by seven frames in the dark and must still be found"
+    )
     stamps, _ = tracker.trajectory()
     assert len(stamps) == 33, "lost frames have no pose"
     assert ate(tracker, path) < 0.005
 
 
-def test_a_calm_camera_asks_the_map_at_once_and_a_jolted_one_first_guesses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_calm_camera_asks_the_map_at_once_and_a_jolted_one_first_guesses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The jolt: the picture moves by 45 px from one frame to the next."""
     tracker, guessed = Tracker(CAMERA, features=500), []
     solve = tracker._localizer._solve
-    monkeypatch.setattr(tracker._localizer, "_solve", lambda *a, **k: guessed.append(len(poses)) or solve(*a, **k))
+    monkeypatch.setattr(
+        tracker._localizer, "_solve", lambda *a, **k: guessed.append(len(poses)) or solve(*a, **k)
+    )
     path = exp_se3(np.outer(np.arange(24), [0.006, 0.0, 0.0, 0.0, 0.003, 0.0]))
     path[23] = path[23] @ exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.16, 0.0]))
     poses: list[Pose] = []
@@ -84,7 +92,9 @@ def test_a_calm_camera_asks_the_map_at_once_and_a_jolted_one_first_guesses(monke
 
 
 def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five are missing, in which the wall moves by 72 px: no place is looked up, for the motion says where to look."""
+    """Five are missing, in which the wall moves by 72 px: no place is looked up, for the motion
+    says where to look.
+    """
     path = exp_se3(np.outer(np.arange(13) - 5, [0.12, 0.0, 0.01, 0.0, 0.01, 0.0]))
     tracker = Tracker(CAMERA, features=600)
 
@@ -124,7 +134,9 @@ def test_a_mask_over_everything_costs_no_frame_once_there_is_a_map(views: list[V
         for index, (rgb, depth, _) in enumerate(views)
     ]
     assert all(pose.tracked for pose in poses)
-    assert not any(pose.keyframe for pose in poses[10:25]), "what a mask covers never enters the map"
+    assert not any(pose.keyframe for pose in poses[10:25]), (
+        "what a mask covers never enters the map"
+    )
     assert ate(tracker, camera_path(40)) < 0.005
 
 
@@ -152,12 +164,16 @@ def test_a_picture_matched_whole_takes_depth_at_its_own_time_too(
     np.testing.assert_array_equal(lags[1], lags[0])
 
 
-def test_a_pose_that_is_rejected_judges_no_point(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pose_that_is_rejected_judges_no_point(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
     tracker = Tracker(CAMERA, features=500)
     for index, (rgb, depth, _) in enumerate(views[:2]):
         tracker.track(rgb, depth, index / 30)
 
-    def wrong(T_cw: NDArray[np.float64], points: NDArray[np.float64], *_: object) -> tuple[object, object, object]:
+    def wrong(
+        T_cw: NDArray[np.float64], points: NDArray[np.float64], *_: object
+    ) -> tuple[object, object, object]:
         nothing = np.zeros(len(points), dtype=np.bool_)
         return T_cw, nothing, ~nothing
 
@@ -166,11 +182,20 @@ def test_a_pose_that_is_rejected_judges_no_point(views: list[View], monkeypatch:
     np.testing.assert_array_equal(tracker.map.moved, 0)
 
 
-def features_at(points: list[tuple[float, float]], words: list[int], octaves: list[int]) -> Features:
+def features_at(
+    points: list[tuple[float, float]], words: list[int], octaves: list[int]
+) -> Features:
     pixels = np.array(points, dtype=np.float64)
     descriptors = np.zeros((len(words), 4), dtype=np.uint64)
     descriptors[:, 0] = words
-    return Features(pixels, pixels, np.array(octaves), descriptors, np.ones(len(words)), np.zeros(len(words), bool))
+    return Features(
+        pixels,
+        pixels,
+        np.array(octaves),
+        descriptors,
+        np.ones(len(words)),
+        np.zeros(len(words), bool),
+    )
 
 
 @pytest.mark.parametrize(
@@ -178,16 +203,25 @@ def features_at(points: list[tuple[float, float]], words: list[int], octaves: li
     [((52.0, 40.0), 0, 0b0, True), ((59.0, 40.0), 0, 0b0, False), ((52.0, 40.0), 2, 0b0, False)],
     ids=["near", "too far", "other level"],
 )
-def test_matching_by_projection(keypoint: tuple[float, float], octave: int, word: int, found: bool) -> None:
+def test_matching_by_projection(
+    keypoint: tuple[float, float], octave: int, word: int, found: bool
+) -> None:
     features = features_at([keypoint], [word], [octave])
-    projected = Projected(np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64))
+    projected = Projected(
+        np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64)
+    )
     matches = match_projected(projected, features, radius=5.0)
     assert matches.points.tolist() == ([77] if found else [])
 
 
 def test_matches_are_one_to_one_and_clear() -> None:
-    # point 0 likes corner 0 best; point 1 likes it too but less; point 2 cannot tell corners 1 and 2 apart
-    i, j, bits = np.array([0, 0, 1, 2, 2]), np.array([0, 1, 0, 1, 2]), np.array([10, 60, 20, 30, 31])
+    # point 0 likes corner 0 best; point 1 likes it too but less; point 2 cannot tell corners 1 and
+    # 2 apart
+    i, j, bits = (
+        np.array([0, 0, 1, 2, 2]),
+        np.array([0, 1, 0, 1, 2]),
+        np.array([10, 60, 20, 30, 31]),
+    )
     points, keypoints = one_to_one(i, j, bits, ratio=0.9)
     assert points.tolist() == [0]
     assert keypoints.tolist() == [0]
@@ -199,7 +233,10 @@ def test_matches_are_one_to_one_and_clear() -> None:
     [
         ({"rgb": BLACK.astype(np.float32)}, r"rgb is float32 \(240, 320, 3\), not uint8"),
         ({"rgb": BLACK[:200]}, r"rgb is uint8 \(200, 320, 3\), not uint8 \(240, 320, 3\)"),
-        ({"depth": (1000 * NOTHING).astype(np.uint16)}, r"depth is uint16 .*, not float \(240, 320\) in m"),
+        (
+            {"depth": (1000 * NOTHING).astype(np.uint16)},
+            r"depth is uint16 .*, not float \(240, 320\) in m",
+        ),
         ({"mask": np.zeros((240, 320), dtype=np.uint8)}, r"mask is uint8 .*, not bool"),
         ({"t": 1.0}, r"frame at 1\.000000 s: not after the frame before it, at 1\.000000 s"),
     ],

@@ -1,4 +1,6 @@
-"""The dense cloud of a rendered room with walking people, held against the room as it is without them."""
+"""The dense cloud of a rendered room with walking people, held against the room as it is without
+them.
+"""
 
 from pathlib import Path
 
@@ -20,15 +22,18 @@ FRAMES, SIZE = 60, (240, 320)
 
 
 def in_the_world(run: Path, folder: Path) -> NDArray[np.float64]:
-    """[n, 3] a run's cloud in the ground truth's world, m, by the first pose: a short way fixes no rotation."""
+    """[n, 3] a run's cloud in the ground truth's world, m, by the first pose: a short way fixes no
+    rotation.
+    """
     truth, estimate = match(read_tum(folder / "groundtruth.txt"), read_tum(run / "trajectory.txt"))
     T = truth.poses[0] @ np.linalg.inv(estimate.poses[0])
     return np.asarray(read_ply(run / "cloud.ply")[0] @ T[:3, :3].T + T[:3, 3])
 
 
 def errors_and_people(points: NDArray[np.float64], scene: Scene) -> tuple[NDArray[np.float64], int]:
-    """[n] m from each point to the empty room's surface behind or before it, in the true view that shows it best; and
-    how many of those that are 10 cm off in every view lie within 10 cm of somebody, 20 cm before the room, in one."""
+    """[n] m from each point to the empty room's surface behind or before it, in the true view that
+    shows it best; and how many of those that are 10 cm off in every view lie within 10 cm of
+    somebody, 20 cm before the room, in one."""
     atlas, camera = scene.atlas(), scene.camera
     best, people = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.bool_)
     for frame in range(0, FRAMES, 4):
@@ -43,7 +48,9 @@ def errors_and_people(points: NDArray[np.float64], scene: Scene) -> tuple[NDArra
         ahead, u, v, z = ahead[inside], u[inside], v[inside], z[inside]
         off = z - room[v, u]
         best[ahead] = np.minimum(best[ahead], np.abs(off))
-        people[ahead] |= (full.instance[v, u] > 0) & (np.abs(z - full.depth[v, u]) < 0.1) & (off < -0.2)
+        people[ahead] |= (
+            (full.instance[v, u] > 0) & (np.abs(z - full.depth[v, u]) < 0.1) & (off < -0.2)
+        )
     return best, int((people & (best > 0.1)).sum())
 
 
@@ -62,4 +69,6 @@ def test_nobody_is_left_in_the_room_and_the_room_is_where_it_is(tmp_path: Path) 
     for mask in (folder / "masks").iterdir():
         mask.rename(mask.with_suffix(".away"))
     slam(sequence=folder, out=tmp_path / "unmasked", cloud=True)
-    assert errors_and_people(in_the_world(tmp_path / "unmasked", folder), scene)[1] > 1000, "the count sees people"
+    assert errors_and_people(in_the_world(tmp_path / "unmasked", folder), scene)[1] > 1000, (
+        "the count sees people"
+    )

@@ -1,4 +1,6 @@
-"""The map's files: still things where they are, nobody who walked through, readable by others' readers."""
+"""The map's files: still things where they are, nobody who walked through, readable by others'
+readers.
+"""
 
 from pathlib import Path
 
@@ -24,7 +26,9 @@ Points = NDArray[np.float64]
 
 
 def off_the_room(points: Points) -> Points:
-    """[n] m between points and the nearest of the room's planes; the first camera's frame is the room's."""
+    """[n] m between points and the nearest of the room's planes; the first camera's frame is the
+    room's.
+    """
     distances = []
     for item in room():
         normal = np.cross(item.across, item.down)
@@ -33,7 +37,9 @@ def off_the_room(points: Points) -> Points:
 
 
 def on_the_board(points: Points) -> NDArray[np.bool_]:
-    """Where the passer-by's board went, 1.6 m from the first camera and 30 cm before anything still."""
+    """Where the passer-by's board went, 1.6 m from the first camera and 30 cm before anything
+    still.
+    """
     return (np.abs(points[:, 2] - 1.6) < 0.12) & (np.abs(points[:, 1]) < 0.7)
 
 
@@ -42,7 +48,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `cohdc slam --cloud` leaves of a room that a board is carried through."""
     folder = tmp_path_factory.mktemp("map")
     sequence = write_sequence(folder / "walk", 36, with_passer_by=True)
-    words = ["slam", "--sequence", str(sequence), "--masks", str(sequence / "masks"), "--out", str(folder / "run")]
+    words = [
+        "slam",
+        "--sequence",
+        str(sequence),
+        "--masks",
+        str(sequence / "masks"),
+        "--out",
+        str(folder / "run"),
+    ]
     assert main([*words, "--features", "500", "--cloud"]) == 0
     assert {path.name for path in folder.iterdir()} == {"walk", "run"}
     return folder / "run"
@@ -86,7 +100,9 @@ def test_a_map_of_a_run_that_never_found_its_way_is_empty_and_valid(tmp_path: Pa
     assert not (tmp_path / "run" / "map.png").exists()
 
 
-def views(steps: list[int], boards: list[int | None]) -> list[tuple[float, NDArray[np.uint8], NDArray[np.float32]]]:
+def views(
+    steps: list[int], boards: list[int | None]
+) -> list[tuple[float, NDArray[np.uint8], NDArray[np.float32]]]:
     """Frames for `fuse`, without masks; a board of the given step stands in some."""
     path, frames = camera_path(60), []
     for step, board in zip(steps, boards, strict=True):
@@ -103,7 +119,9 @@ def true_poses(steps: list[int]) -> dict[float, Points]:
 def test_who_was_seen_once_or_seen_through_is_left_out() -> None:
     steps = [0, 5, 10, 15, 20]
     stays = fuse(views(steps, [20] * 5), true_poses(steps), CAMERA, 0.02)
-    assert on_the_board(stays.points).sum() > 1000, "who never moves and has no mask is part of the room"
+    assert on_the_board(stays.points).sum() > 1000, (
+        "who never moves and has no mask is part of the room"
+    )
     once = fuse(views(steps[:2], [None, 20]), true_poses(steps), CAMERA, 0.02)
     leaves = fuse(views(steps, [20, 20, None, None, None]), true_poses(steps), CAMERA, 0.02)
     for cloud in (once, leaves):
@@ -116,7 +134,9 @@ def test_a_keyframe_without_a_pose_is_left_out() -> None:
     steps = [0, 5, 10]
     frames = views(steps, [None] * 3)
     without = fuse(frames, true_poses(steps[:2]), CAMERA, 0.02)
-    np.testing.assert_array_equal(without.points, fuse(frames[:2], true_poses(steps), CAMERA, 0.02).points)
+    np.testing.assert_array_equal(
+        without.points, fuse(frames[:2], true_poses(steps), CAMERA, 0.02).points
+    )
 
 
 def test_depth_is_refused_beside_edges_masks_and_far_away() -> None:
@@ -129,7 +149,9 @@ def test_depth_is_refused_beside_edges_masks_and_far_away() -> None:
     assert np.flatnonzero(kept).tolist() == [*range(10 + 1, 60 - 2), *range(60 + 2, 90 - 2)]
 
 
-clouds = arrays(np.float64, st.tuples(st.integers(1, 60), st.just(3)), elements=st.floats(-50, 50, width=32))
+clouds = arrays(
+    np.float64, st.tuples(st.integers(1, 60), st.just(3)), elements=st.floats(-50, 50, width=32)
+)
 
 
 @given(clouds, st.integers(0, 1_000_000))
@@ -138,13 +160,17 @@ def test_cubes_hold_means_whatever_the_order(points: Points, seed: int) -> None:
     rng = np.random.default_rng(seed)
     grids = [VoxelGrid(0.5) for _ in range(2)]
     colors = rng.integers(0, 256, points.shape).astype(np.uint8)
-    for grid, order in zip(grids, (np.arange(len(points)), rng.permutation(len(points))), strict=True):
+    for grid, order in zip(
+        grids, (np.arange(len(points)), rng.permutation(len(points))), strict=True
+    ):
         for part in np.array_split(order, 3):
             grid.add(points[part], colors[part], 0)
     first, second = (grid.cells(1)[0] for grid in grids)
     np.testing.assert_allclose(first, second, atol=1e-9)
     assert len(first) == len(np.unique(np.floor(points / 0.5), axis=0))
-    assert np.linalg.norm(points[:, None] - first[None], axis=2).min(axis=1).max() <= 0.5 * np.sqrt(3)
+    assert np.linalg.norm(points[:, None] - first[None], axis=2).min(axis=1).max() <= 0.5 * np.sqrt(
+        3
+    )
 
 
 @given(clouds)
@@ -155,7 +181,9 @@ def test_memory_is_bounded_by_larger_cubes(points: Points) -> None:
         grid.add(points, np.zeros(points.shape, np.uint8), picture)
     means, _ = grid.cells()
     assert 1 <= len(means) <= 8
-    assert len(means) == len(np.unique(np.floor(points / grid.edge), axis=0)), "as if it had been so large at once"
+    assert len(means) == len(np.unique(np.floor(points / grid.edge), axis=0)), (
+        "as if it had been so large at once"
+    )
 
 
 def test_seen_from_above_right_is_right_and_forward_is_up() -> None:
@@ -177,4 +205,8 @@ def test_a_known_ply_file(tmp_path: Path) -> None:
     points, colors = read_ply(tmp_path / "a.ply")
     assert points.tolist() == [[1.0, -2.5, 3.0]]
     assert colors.tolist() == [[7, 8, 9]]
-    assert (tmp_path / "a.ply").read_bytes().endswith(np.array([1, -2.5, 3], "<f4").tobytes() + bytes([7, 8, 9]))
+    assert (
+        (tmp_path / "a.ply")
+        .read_bytes()
+        .endswith(np.array([1, -2.5, 3], "<f4").tobytes() + bytes([7, 8, 9]))
+    )

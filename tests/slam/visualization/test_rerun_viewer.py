@@ -1,4 +1,6 @@
-"""A run shown in rerun: recorded without a window, read back by rerun's own tool; and what happens without it."""
+"""A run shown in rerun: recorded without a window, read back by rerun's own tool; and what happens
+without it.
+"""
 
 import subprocess
 import sys
@@ -17,18 +19,33 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(sequence: Path, out: Path) -> list[str]:
-    words = ["slam", "--sequence", str(sequence), "--masks", str(sequence / "masks"), "--out", str(out)]
+    words = [
+        "slam",
+        "--sequence",
+        str(sequence),
+        "--masks",
+        str(sequence / "masks"),
+        "--out",
+        str(out),
+    ]
     return [*words, "--features", "400"]
 
 
-def test_a_recording_holds_camera_image_mask_map_way_and_times(sequence: Path, tmp_path: Path) -> None:
+def test_a_recording_holds_camera_image_mask_map_way_and_times(
+    sequence: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk comes with the view extra")
-    assert main([*arguments(sequence, tmp_path / "run"), "--rrd", str(tmp_path / "rrd" / "run.rrd")]) == 0
+    assert (
+        main([*arguments(sequence, tmp_path / "run"), "--rrd", str(tmp_path / "rrd" / "run.rrd")])
+        == 0
+    )
     assert [path.name for path in (tmp_path / "rrd").iterdir()] == ["run.rrd"]
     rerun = [sys.executable, "-m", "rerun", "rrd"]
     recording = str(tmp_path / "rrd" / "run.rrd")
     subprocess.run([*rerun, "verify", recording], check=True, capture_output=True)
-    stats = subprocess.run([*rerun, "stats", recording], check=True, capture_output=True, text=True).stdout
+    stats = subprocess.run(
+        [*rerun, "stats", recording], check=True, capture_output=True, text=True
+    ).stdout
     parts = (
         "world/camera/image",
         "world/camera/mask",
@@ -40,7 +57,12 @@ def test_a_recording_holds_camera_image_mask_map_way_and_times(sequence: Path, t
     )
     for part in parts:
         assert f"\n/{part}: " in stats, part
-    for component in ("Pinhole:image_from_camera", "Transform3D:translation", "Points3D:colors", "EncodedImage:blob"):
+    for component in (
+        "Pinhole:image_from_camera",
+        "Transform3D:translation",
+        "Points3D:colors",
+        "EncodedImage:blob",
+    ):
         assert f"\n{component}: " in stats, component
 
 
