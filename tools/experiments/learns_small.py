@@ -58,6 +58,9 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument("--contenders", nargs="*", help="these only")
     parser.add_argument(
+        "--classes", nargs="*", help="train on these classes only, on the images that show them"
+    )
+    parser.add_argument(
         "--cell",
         nargs=5,
         metavar=("NAME", "DATA", "MINUTES", "SEED", "FOLDER"),
@@ -80,6 +83,11 @@ def main() -> int:
         train_cell(name, Path(data), float(minutes), int(seed), Path(folder), arguments)
         return 0
     names = arguments.contenders or contenders()
+    if arguments.classes:
+        arguments.data = [
+            select_classes(data, arguments.classes, arguments.out / "data")
+            for data in arguments.data
+        ]
     waiting = [
         (name, data.resolve(), minutes, seed)
         for minutes in arguments.minutes
@@ -101,6 +109,28 @@ def main() -> int:
     plot_curves(cells, arguments.out / "curves.png")
     print(table)
     return 0
+
+
+def select_classes(data: Path, classes: list[str], out: Path) -> Path:
+    """Write a COCO folder with these classes only, and with the images that show them.
+
+    Returns out/NAME_CLASSES; its images/ is a link to the original folder.
+    """
+    folder = out / "_".join([data.name, *classes])
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "images").exists():
+        (folder / "images").symlink_to((data / "images").resolve())
+
+    for name in ("instances_train.json", "instances_val.json"):
+        content = json.loads((data / name).read_text(encoding="utf-8"))
+        kept = [row for row in content["categories"] if row["name"] in classes]
+        ids = {row["id"] for row in kept}
+        annotations = [row for row in content["annotations"] if row["category_id"] in ids]
+        shown = {row["image_id"] for row in annotations}
+        images = [row for row in content["images"] if row["id"] in shown]
+        content |= {"categories": kept, "annotations": annotations, "images": images}
+        (folder / name).write_text(json.dumps(content), encoding="utf-8")
+    return folder
 
 
 def folder_of(out: Path, name: str, data: Path, minutes: float, seed: int) -> Path:
