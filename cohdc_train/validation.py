@@ -12,13 +12,14 @@ from cohdc_train.data.coco import CocoSplit
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import check_folder, claim_folder, write_json
-from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics, category_names
+from cohdc_train.metrics.average_precision import category_names
+from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.train.cli import told_in_one_line
 from cohdc_train.train.malloc import keep_freed_memory
+from cohdc_train.train.messages import user_errors
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.validation_figures import VALIDATION_FILES, draw_validation, write_files
+from cohdc_train.train.validation_figures import VALIDATION_FILES, draw_validation, write_figures
 
 
 def validate(
@@ -76,7 +77,7 @@ def validate(
     if pictures is not None:
         claim_folder(pictures, "validate", VALIDATION_FILES, "--pictures")
         split = CocoDataModule(root, category_names(results.truth)).folder.val
-        write_files(pictures, draw_validation(results, split.images))
+        write_figures(pictures, draw_validation(results, split.images))
     return results.scores
 
 
@@ -117,13 +118,13 @@ def score_module(
     """
     module.rescore = module.rescore if rescore is None else rescore
     module.min_quality = min_quality
-    with told_in_one_line():
+    with user_errors():
         trainer = Trainer(
             logger=False,
             enable_checkpointing=False,
-            precision=precision,
+            precision=precision,  # type: ignore[arg-type]
             enable_model_summary=False,
-        )  # type: ignore[arg-type]
+        )
         trainer.validate(module, datamodule=data, verbose=False)
     if module.results is None:
         raise RuntimeError("validation left no results")

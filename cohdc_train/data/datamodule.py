@@ -155,7 +155,13 @@ class CocoDataModule(pl.LightningDataModule):
             train = tuple(split.subset(self.subset.train) for split in whole.train)
             self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
             if self.overfit:
-                same = train[0].with_objects().subset(self.overfit)
+                usable = train[0].with_objects()
+                if self.overfit > len(usable.images):
+                    raise DataError(
+                        f"--overfit {self.overfit}: {usable.annotations} has "
+                        f"{len(usable.images)} training images with objects; give at most so many"
+                    )
+                same = usable.subset(self.overfit)
                 self._folder = CocoFolder((same,), same)
         return self._folder
 

@@ -141,7 +141,7 @@ def test_mobilenet_sees_pixels_from_minus_one_to_one_padded_below_and_right():
     with torch.no_grad():
         body.stem_block.conv.weight.zero_()
         body.stem_block.conv.weight[:, 1, 1, 1] = (
-            1.0  # green, the kernel's centre: pixels 1, 3, 5 ...
+            1.0  # green, the kernel's center: pixels 1, 3, 5 ...
         )
     green = torch.arange(64.0).repeat(64, 1) / 63
     image = torch.stack([torch.zeros(64, 64), green, torch.zeros(64, 64)])

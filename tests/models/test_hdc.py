@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cohdc_train.models.hdc import cycle, holes, max_distance, receptive_field
+from cohdc_train.models.hdc import cycle_rates, holes, max_distance, receptive_field
 
 
 @pytest.mark.parametrize(
@@ -45,10 +45,10 @@ def test_a_bad_pattern_is_refused_with_its_holes():
     with pytest.raises(
         ValueError, match=r"\(2, 2, 2, 2\) leave holes: offsets \+-\(1, 3, 5, 7\) px"
     ):
-        cycle((2,), 4)
+        cycle_rates((2,), 4)
 
 
 @pytest.mark.parametrize("pattern", [(), (0, 1), (1, -2)])
 def test_rates_below_one_are_refused(pattern):
     with pytest.raises(ValueError, match="at least 1"):
-        cycle(pattern, 3)
+        cycle_rates(pattern, 3)

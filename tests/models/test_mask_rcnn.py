@@ -17,6 +17,7 @@ from torchvision.ops import box_iou
 
 from cohdc_train.models import Detector, MaskRCNN, NetworkConfig, detect
 from cohdc_train.models.inference import cut_by_quality
+from cohdc_train.models.roi_losses import sample_proposals
 
 
 def _target(boxes, size=(96, 128), ignore=()):
@@ -288,7 +289,7 @@ def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
         losses = network.losses(torch.rand(1, 3, 96, 1024), targets)
         features = network.features(torch.rand(1, 3, 96, 1024))
         proposals, *_ = network.rpn((96, 1024), list(features.values()), targets, 100)
-        sampled, _, _, _ = network._sample(proposals, targets)
+        sampled = sample_proposals(network.roi_heads, proposals, targets).boxes
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert features["0"].dtype == torch.bfloat16
     assert sampled[0].dtype == network.rpn.anchors(0, features["0"]).dtype == torch.float32

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cohdc_train.models.ops import nms_keep, nms_keep_at_once
+from cohdc_train.models.ops import nms_keep, nms_keep_batched
 
 
 @settings(deadline=None, max_examples=40)
@@ -16,7 +16,7 @@ def test_suppressing_all_images_at_once_keeps_what_one_after_the_other_does(seed
         [corner, corner + torch.rand(images, count, 2, generator=generator) * 200], dim=2
     )
     scores = torch.rand(images, count, generator=generator)
-    at_once = nms_keep_at_once(boxes, scores, 0.5, 0.3)
+    at_once = nms_keep_batched(boxes, scores, 0.5, 0.3)
     assert torch.equal(at_once, nms_keep(boxes, scores, 0.5, 0.3))
     assert not at_once[scores <= 0.3].any()
     assert at_once.any(dim=1).equal((scores > 0.3).any(dim=1))

@@ -16,7 +16,7 @@ from cohdc_train.train import module
 class Probe(pl.Callback):
     """Writes `rankN.pt`: the losses of every step, the validation scores and the trained weights.
 
-    Validation is on detections made of the toy images' colours: a network of a few steps would not
+    Validation is on detections made of the toy images' colors: a network of a few steps would not
     give any.
     apart: a fault on purpose, every rank keeps its own gradients.
     """
@@ -53,14 +53,14 @@ class Probe(pl.Callback):
 
 
 def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
-    """One detection per colour of the toy images, off by an amount that follows from the image's
+    """One detection per color of the toy images, off by an amount that follows from the image's
     pixels.
     """
     found = []
     for image in images:
         boxes, labels = [], []
-        for label, colour in enumerate(coco_toys.COLOURS.values()):
-            inside = (image == torch.tensor(colour)[:, None, None]).all(dim=0)
+        for label, color in enumerate(coco_toys.COLOURS.values()):
+            inside = (image == torch.tensor(color)[:, None, None]).all(dim=0)
             rows, columns = inside.any(dim=1).nonzero()[:, 0], inside.any(dim=0).nonzero()[:, 0]
             if len(rows):
                 boxes.append(

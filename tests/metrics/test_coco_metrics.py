@@ -13,14 +13,10 @@ from pycocotools import mask as rle
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from cohdc_train.metrics.coco_metrics import (
-    SegmentationMetrics,
-    average_precision,
-    calibration,
-    encode,
-    match_masks,
-    overlap_scores,
-)
+from cohdc_train.metrics.average_precision import average_precision
+from cohdc_train.metrics.coco_metrics import SegmentationMetrics
+from cohdc_train.metrics.detection_rows import encode_detections
+from cohdc_train.metrics.mask_overlap import calibration, match_masks, overlap_scores
 
 SIZE = (60, 80)
 
@@ -271,7 +267,7 @@ def test_only_seen_images_count() -> None:
 
 def test_encode_keeps_the_best_hundred_and_pastes_masks() -> None:
     boxes = [[10.0, 10.0, 30.0, 30.0]] * 120
-    rows = encode(7, SIZE, detection(boxes, [i / 120 for i in range(120)], [1.0] * 120))
+    rows = encode_detections(7, SIZE, detection(boxes, [i / 120 for i in range(120)], [1.0] * 120))
     assert len(rows) == 100
     assert rows[0]["score"] == pytest.approx(119 / 120)
     assert rows[0]["bbox"] == [10, 10, 20, 20]

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
@@ -10,6 +11,7 @@ from urllib.error import URLError
 import pytest
 import torch
 import yaml
+from lightning.pytorch.utilities import rank_zero_info
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 import coco_toys
@@ -17,15 +19,16 @@ import coco_toys
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import NetworkConfig
-from cohdc_train.train.cli import fit, told_in_one_line
+from cohdc_train.train.cli import fit
+from cohdc_train.train.messages import user_errors
 from cohdc_train.train.module import MaskRCNNModule
 
 TINY = """
 data: {canvas: [48, 64], workers: 0}
 model:
-  network: {depth: 18, width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16,
-            proposals: [50, 20]}
-trainer: {accelerator: cpu, max_epochs: 1, enable_model_summary: false, precision: 32-true}
+  network: {depth: 18, width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64],
+            rois: 16, proposals: [50, 20]}
+trainer: {accelerator: cpu, max_epochs: 1, precision: 32-true}
 pictures: false
 """
 
@@ -48,7 +51,7 @@ def run(toy: Path) -> Path:
     return out
 
 
-def test_a_fit_leaves_checkpoints_logs_and_its_configuration(run: Path) -> None:
+def test_fit_writes_checkpoints_logs_and_configuration(run: Path) -> None:
     assert {"best.ckpt", "last.ckpt", "config.yaml", "logs"} <= {
         path.name for path in run.iterdir()
     }
@@ -69,7 +72,7 @@ def test_a_fit_leaves_checkpoints_logs_and_its_configuration(run: Path) -> None:
     assert list((run / "logs").glob("*/events.out.tfevents*"))
 
 
-def test_the_saved_configuration_is_whole_and_runs_again(toy: Path, run: Path) -> None:
+def test_saved_configuration_repeats_the_training(toy: Path, run: Path) -> None:
     saved = yaml.safe_load((run / "config.yaml").read_text())
     assert saved["data"]["root"] == str(toy)
     assert saved["model"]["optimizer"]["name"] == "adamw"
@@ -92,7 +95,7 @@ def test_a_checkpoint_loads_without_the_weights_it_started_from(run: Path) -> No
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", None])
-def test_what_is_no_checkpoint_is_told_in_one_line(tmp_path: Path, content: bytes | None) -> None:
+def test_load_refuses_other_files_in_one_line(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "some.ckpt"
     if content is None:
         torch.save({"weights": torch.zeros(1)}, path)
@@ -133,7 +136,7 @@ def test_training_ends_with_scores_files_and_the_next_command(
 ) -> None:
     fit(arguments(toy, tmp_path))
     lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
-    end = "\n".join(lines[-6:])
+    end = "\n".join(lines[-7:])
     assert re.search(
         r"^best\.ckpt: mask AP \d\.\d{3}, AP50 \d\.\d{3} on the validation split$", end, re.M
     )
@@ -206,9 +209,6 @@ def test_failed_download_names_the_flag_for_a_local_file(
     assert "--pretrained FILE.pth" in last
 
 
-@pytest.mark.filterwarnings(
-    "ignore:The dirpath has changed"
-)  # a true warning, and here the intention
 def test_training_resumes_with_more_epochs(toy: Path, run: Path) -> None:
     trainer = fit(
         arguments(
@@ -218,7 +218,7 @@ def test_training_resumes_with_more_epochs(toy: Path, run: Path) -> None:
     assert (trainer.current_epoch, trainer.global_step) == (2, 6)
 
 
-def test_a_training_starts_from_the_weights_of_another(toy: Path, run: Path) -> None:
+def test_training_starts_from_weights_of_another(toy: Path, run: Path) -> None:
     still = ("--model.optimizer.lr=1e-12", f"--pretrained={run / 'last.ckpt'}")
     fit(arguments(toy, toy / "same", *still))
     before, after = (MaskRCNNModule.load(out / "last.ckpt").network for out in (run, toy / "same"))
@@ -226,12 +226,12 @@ def test_a_training_starts_from_the_weights_of_another(toy: Path, run: Path) -> 
         torch.testing.assert_close(new, old, atol=1e-6, rtol=0, msg=name)
 
 
-def test_other_classes_take_over_all_but_what_decides_between_classes(run: Path) -> None:
+def test_other_classes_load_all_but_class_layers(run: Path) -> None:
     before = MaskRCNNModule.load(run / "last.ckpt")
     for names in (["person"], ["dog", "cat"]):  # the second has as many classes
         module = MaskRCNNModule(names, before.network_config)
         own = {name: weights.clone() for name, weights in module.network.state_dict().items()}
-        left = module.take_over(run / "last.ckpt")
+        left = module.load_pretrained(run / "last.ckpt")
         assert {name.rsplit(".", 2)[-2] for name in left} == {
             "cls_score",
             "bbox_pred",
@@ -249,10 +249,10 @@ def test_a_checkpoint_without_a_fitting_weight_is_refused(run: Path) -> None:
     module = MaskRCNNModule(["dog"], other)
     module.network = torch.nn.ModuleDict({"another": torch.nn.Linear(1, 1)})  # type: ignore[assignment]
     with pytest.raises(CohdcError, match=r"last\.ckpt: none of the weights of its backbone fits"):
-        module.take_over(run / "last.ckpt")
+        module.load_pretrained(run / "last.ckpt")
 
 
-def test_a_changed_class_map_is_refused(
+def test_resume_refuses_other_classes(
     toy: Path, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = main(
@@ -262,9 +262,9 @@ def test_a_changed_class_map_is_refused(
         ]
     )
     assert code == 1
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        "cohdc fit: the checkpoint's classes are person, car; the data's are car"
-    )
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"cohdc fit: {run / 'last.ckpt'}: its classes are person, car;")
+    assert "the data's are car; --pretrained" in last
 
 
 def test_validate_prints_and_writes_the_scores(
@@ -332,7 +332,9 @@ def test_a_wrong_key_or_type_is_a_usage_error(toy: Path, wrong: str) -> None:
     assert stop.value.code == 2
 
 
-def test_several_roots_are_a_list(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_folders_become_a_list_of_roots(
+    toy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         fit([f"--data.root=[{toy},{toy}]", "--print_config"])
     assert yaml.safe_load(capsys.readouterr().out)["data"]["root"] == [str(toy), str(toy)]
@@ -394,7 +396,7 @@ def test_fit_keeps_files_it_did_not_write(
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_validate_keeps_pictures_it_did_not_write(
+def test_validate_keeps_figures_it_did_not_write(
     toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "best.jpg").write_text("mine")
@@ -413,7 +415,7 @@ def test_the_batch_size_is_found(
 
 
 @pytest.mark.slow
-def test_two_pictures_are_learnt_by_heart(tmp_path: Path) -> None:
+def test_two_images_are_learned(tmp_path: Path) -> None:
     """Trained and scored on the same two images, every object is found: the whole way from JSON to
     AP is sound.
     """
@@ -456,13 +458,13 @@ def test_two_pictures_are_learnt_by_heart(tmp_path: Path) -> None:
     ],
 )
 def test_error_is_told_by_its_last_line(text: str, told: str) -> None:
-    with pytest.raises(CohdcError) as error, told_in_one_line():
+    with pytest.raises(CohdcError) as error, user_errors():
         raise CohdcError(text)
     assert str(error.value) == told
 
 
 def test_interrupted_training_keeps_its_last_step(
-    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     step = MaskRCNNModule.training_step
 
@@ -475,9 +477,13 @@ def test_interrupted_training_keeps_its_last_step(
     with pytest.raises((SystemExit, KeyboardInterrupt)):
         fit(arguments(toy, tmp_path))
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 2
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert (
+        last == f"interrupted at step 2; --ckpt_path {tmp_path / 'last.ckpt'} continues from there"
+    )
 
 
-def test_network_of_a_resumed_training_has_to_agree(
+def test_resume_refuses_another_network(
     toy: Path, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = main(
@@ -490,7 +496,7 @@ def test_network_of_a_resumed_training_has_to_agree(
     )
     assert code == 1
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "the checkpoint's network has fc 16, this one 32; give --config of its training" in last
+    assert "last.ckpt: its network has fc 16, this one 32; give --config of its training" in last
 
 
 @pytest.mark.parametrize(
@@ -503,7 +509,7 @@ def test_network_of_a_resumed_training_has_to_agree(
         (["--config", "table3/test01.yaml"], "resnet"),
     ],
 )
-def test_default_network_gives_way_to_a_named_one(
+def test_named_network_replaces_the_default(
     options: list[str], backbone: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
@@ -511,7 +517,166 @@ def test_default_network_gives_way_to_a_named_one(
     assert yaml.safe_load(capsys.readouterr().out)["model"]["network"]["backbone"] == backbone
 
 
-@pytest.mark.filterwarnings("ignore:The dirpath has changed")
 def test_repeated_configuration_does_not_resume(toy: Path, run: Path, tmp_path: Path) -> None:
     fit(arguments(toy, tmp_path, "--trainer.max_epochs=2", f"--ckpt_path={run / 'last.ckpt'}"))
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["ckpt_path"] is None
+
+
+def test_resume_names_options_that_differ(
+    toy: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed = (
+        "--trainer.max_epochs=2",
+        "--data.canvas=[64,64]",
+        "--data.batch_size=3",
+        "--model.optimizer.lr=0.5",
+        "--model.optimizer.warmup_ratio=0.1",
+        "--model.network.rates=[[1],[1],[1],[1]]",
+        "--trainer.precision=bf16-mixed",
+        "--ema=0.9",
+    )
+    trainer = fit(arguments(toy, tmp_path, *changed, f"--ckpt_path={run / 'last.ckpt'}"))
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("resume: ")]
+    assert lines == [
+        "resume: --model.optimizer.lr: 0.0012 in the checkpoint, 0.5 was asked for; 0.0012 is used;"
+        " --pretrained CHECKPOINT starts with another one",
+        "resume: --model.network.rates: ((1, 2, 3), (1, 2, 3), (1, 2, 3), (1, 2, 3)) in the "
+        "checkpoint, ((1,), (1,), (1,), (1,)) was asked for; ((1,), (1,), (1,), (1,)) is used",
+        "resume: --data.canvas: (48, 64) in the checkpoint, (64, 64) was asked for; "
+        "(64, 64) is used",
+        "resume: --model.optimizer.warmup_ratio: 0.05 in the checkpoint, 0.1 was asked for; "
+        "0.1 is used",
+        "resume: --data.batch_size: 2 in the checkpoint, 3 was asked for; 3 is used",
+        "resume: --trainer.precision: 32-true in the checkpoint, bf16-mixed was asked for; "
+        "bf16-mixed is used",
+        "resume: --ema: 0.0 in the checkpoint, 0.9 was asked for; "
+        "the average starts at the checkpoint",
+        f"resume: --out {tmp_path} is not the checkpoint's folder; its best.ckpt will be of this "
+        "session",
+    ]
+    resumed = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    assert resumed["hyper_parameters"]["optimizer"]["lr"] == 0.0012
+    assert trainer.optimizers[0].param_groups[0]["initial_lr"] == 0.0012
+    assert resumed["fit_options"] == {"batch_size": 3, "ema": 0.9, "precision": "bf16-mixed"}
+
+
+def test_resume_with_equal_options_prints_no_note(
+    toy: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(arguments(toy, run, f"--ckpt_path={run / 'last.ckpt'}"))
+    out = capsys.readouterr().out
+    assert "resume: " not in out
+    assert "no step was made: the budget counts from the first session" in out
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--model.network.norm=frozen", "its network has norm batch, this one frozen"),
+        ("--model.network.frozen_stages=3", "its network has frozen_stages 0, this one 3"),
+        ("--model.optimizer.name=sgd", "its optimizer has name adamw, this one sgd"),
+    ],
+)
+def test_resume_refuses_what_its_optimizer_cannot_load(
+    toy: Path, run: Path, option: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(["fit", *arguments(toy, toy / "no", option, f"--ckpt_path={run / 'last.ckpt'}")])
+    assert code == 1
+    assert f"last.ckpt: {words}; give --config" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_fit_prints_its_own_lines_only(
+    toy: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    fit(arguments(toy, tmp_path))
+    out, err = capfd.readouterr()
+    assert err == ""
+    words = [line.partition(" ")[0] for line in out.splitlines()]
+    assert words == [
+        *("initial", "HDC", "canvas", "device:", "step"),
+        *("best.ckpt:", "mask", "hint:", "hint:", "time:", "files", "next:"),
+    ]
+    (device,) = [line for line in out.splitlines() if line.startswith("device: ")]
+    assert re.fullmatch(r"device: CPU, precision 32-true, \d+ threads?", device)
+
+
+def test_user_messages_and_warnings_are_shown(
+    toy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level("INFO")
+    step = MaskRCNNModule.training_step
+
+    def talkative(self: MaskRCNNModule, batch: Any, batch_idx: int) -> torch.Tensor:
+        rank_zero_info("information of the user's own")
+        warnings.warn("a warning of the user's own", UserWarning, stacklevel=1)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(MaskRCNNModule, "training_step", talkative)
+    with pytest.warns(UserWarning, match="a warning of the user's own"):
+        fit(arguments(toy, tmp_path, "--trainer.max_steps=1"))
+    assert caplog.messages == ["information of the user's own"]
+
+
+def test_training_without_validation_says_where_its_files_are(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(arguments(toy, tmp_path, "--trainer.limit_val_batches=0"))
+    lines = capsys.readouterr().out.splitlines()
+    assert "no validation chose best.ckpt: it has the weights of last.ckpt" in lines
+    assert lines[-2] == f"files in {tmp_path}: best.ckpt, last.ckpt, config.yaml, logs"
+    assert lines[-1] == f"next: cohdc export {tmp_path / 'best.ckpt'} --images {toy / 'images'}"
+    best, last = (
+        torch.load(tmp_path / name, weights_only=True)["state_dict"]
+        for name in ("best.ckpt", "last.ckpt")
+    )
+    assert all(torch.equal(best[name], last[name]) for name in last)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--checkpoint.filename=mine",
+        "--checkpoint.save_top_k=3",
+        "--checkpoint.save_top_k=0",
+        "--checkpoint.save_weights_only=true",
+        "--checkpoint.save_last=true",
+        "--checkpoint.enable_version_counter=true",
+    ],
+)
+def test_options_that_rename_checkpoints_are_refused(
+    toy: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", *arguments(toy, tmp_path, option)]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"cohdc fit: {option.partition('=')[0]} ")
+    assert "keeps best.ckpt and last.ckpt" in last
+
+
+@pytest.mark.parametrize("monitor", ["val/box_AP", "null"])
+def test_best_checkpoint_exists_whatever_it_watches(
+    toy: Path, tmp_path: Path, monitor: str
+) -> None:
+    fit(arguments(toy, tmp_path, f"--checkpoint.monitor={monitor}"))
+    assert {"best.ckpt", "last.ckpt"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_overfit_on_more_images_than_there_are_is_refused(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", *arguments(toy, tmp_path, "--overfit=1000")]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == (
+        f"cohdc fit: --overfit 1000: {toy / 'instances_train.json'} has 6 training images with "
+        "objects; give at most so many"
+    )
+
+
+def test_closing_lines_state_the_time_to_the_first_step_and_between_epochs(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(arguments(toy, tmp_path, "--trainer.max_epochs=3"))
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if line.startswith("time: ")]
+    assert re.fullmatch(
+        r"time: \d+\.\d s to the first step, \d+\.\d s between epochs \(without validation\)", line
+    )

@@ -52,11 +52,11 @@ def test_boundaries_are_those_of_faster_coco_eval(seed: int) -> None:
     rng = np.random.default_rng(seed)
     canvas = np.zeros(SIZE, np.uint8)
     for _ in range(int(rng.integers(1, 4))):
-        centre, axes = (
+        center, axes = (
             (int(rng.integers(0, 80)), int(rng.integers(0, 60))),
             (int(rng.integers(1, 40)), 9),
         )
-        cv2.ellipse(canvas, centre, axes, float(rng.integers(0, 180)), 0, 360, 1, -1)
+        cv2.ellipse(canvas, center, axes, float(rng.integers(0, 180)), 0, 360, 1, -1)
     shape = whole_rle(canvas.astype(np.bool_))
     expected = theirs.decode(theirs.rleToBoundary(shape))
     assert np.array_equal(theirs.decode(boundary_rle(shape, SIZE)), expected)

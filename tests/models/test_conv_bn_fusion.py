@@ -9,11 +9,11 @@ import torch
 from torch import nn
 from torchvision.ops import FrozenBatchNorm2d
 
-from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fused
+from cohdc_train.models import MaskRCNN, NetworkConfig, detect, fuse_conv_bn
 from cohdc_train.models.frozen_norm import (
     FoldingConv2d,
     FrozenNorm,
-    conv_norm_pairs,
+    conv_bn_pairs,
     plain_convolution,
 )
 
@@ -58,7 +58,9 @@ def test_it_finds_what_the_network_finds(shape, norm):
         torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8),
         torch.zeros((3, 40, 90), dtype=torch.uint8),
     ]
-    for ours, theirs in zip(detect(fused(network), images), detect(network, images), strict=True):
+    for ours, theirs in zip(
+        detect(fuse_conv_bn(network), images), detect(network, images), strict=True
+    ):
         assert len(theirs["boxes"]) > 0
         for name in theirs:
             torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-3)
@@ -69,8 +71,8 @@ def test_weights_in_bfloat16_are_those_that_autocast_makes(shape):
     network = network_of(shape, "batch")
     images = [torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8)]
     with torch.autocast("cpu", torch.bfloat16):
-        (ours,) = detect(fused(network, torch.bfloat16), images)
-        (theirs,) = detect(fused(network), images)
+        (ours,) = detect(fuse_conv_bn(network, torch.bfloat16), images)
+        (theirs,) = detect(fuse_conv_bn(network), images)
     assert len(theirs["boxes"]) > 0
     for name in theirs:
         assert torch.equal(ours[name], theirs[name])
@@ -80,7 +82,7 @@ def test_weights_in_bfloat16_are_those_that_autocast_makes(shape):
 def test_every_norm_is_folded_and_the_network_keeps_its_own(shape):
     network = network_of(shape, "batch")
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    copied = fused(network)
+    copied = fuse_conv_bn(network)
     assert not [m for m in copied.modules() if isinstance(m, nn.BatchNorm2d | FrozenNorm)]
     assert not any(parameter.requires_grad for parameter in copied.parameters())
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
@@ -90,7 +92,7 @@ def test_every_norm_is_folded_and_the_network_keeps_its_own(shape):
 def test_frozen_norms_are_applied_by_the_convolutions_with_equal_gradients(shape):
     network = network_of(shape, "frozen").backbone.body.train()
     reference = copy.deepcopy(network)
-    for module, name, norm_name in list(conv_norm_pairs(reference)):
+    for module, name, norm_name in list(conv_bn_pairs(reference)):
         plain_convolution(getattr(module, name))
         norm = FrozenBatchNorm2d(
             getattr(module, norm_name).weight.numel(), getattr(module, norm_name).eps

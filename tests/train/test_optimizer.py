@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import Timer
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN, NetworkConfig
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, training_progress
+from cohdc_train.train.optimizer import OptimizerConfig, build_optimizer, elapsed_fraction
 
 TINY = NetworkConfig(depth=18, width=0.125, fpn_channels=8, fc=16, canvas=(32, 32))
 
@@ -120,10 +120,10 @@ def test_rate_follows_the_clock_where_time_ends_the_training(
         "enable_progress_bar": False,
     }
     trainer = Trainer(max_epochs=-1, max_time={"seconds": 100}, **options)
-    progress = training_progress(trainer, math.inf)
+    progress = elapsed_fraction(trainer, math.inf)
     assert progress is not None
     config = OptimizerConfig(
-        warmup_ratio=0.1, lr=1.0, final_fraction=0.0, backbone_lr=0.5, frozen_steps=3
+        warmup_ratio=0.1, lr=1.0, final_fraction=0.0, backbone_lr=0.5, backbone_freeze_steps=3
     )
     optimizer, schedule = build_optimizer(config, MaskRCNN(1, TINY), progress, False)
     rates = []
@@ -149,13 +149,13 @@ def test_progress_is_the_further_of_steps_and_time(monkeypatch: pytest.MonkeyPat
         "enable_checkpointing": False,
         "enable_progress_bar": False,
     }
-    timed = training_progress(Trainer(max_epochs=3, max_time={"seconds": 100}, **options), 50)
-    counted = training_progress(Trainer(max_epochs=3, **options), 50)
+    timed = elapsed_fraction(Trainer(max_epochs=3, max_time={"seconds": 100}, **options), 50)
+    counted = elapsed_fraction(Trainer(max_epochs=3, **options), 50)
     assert timed is not None
     assert counted is not None
     assert [timed(step) for step in (0, 10, 25)] == pytest.approx([0.3, 0.3, 0.5])
     assert [counted(step) for step in (0, 10, 25)] == pytest.approx([0.0, 0.2, 0.5])
-    assert training_progress(Trainer(max_epochs=-1, **options), math.inf) is None
+    assert elapsed_fraction(Trainer(max_epochs=-1, **options), math.inf) is None
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,12 @@ def rates(built: MaskRCNNModule, steps: int) -> list[tuple[float, float]]:
 def test_backbone_is_frozen_then_follows_at_its_share() -> None:
     found = rates(
         module(
-            total=20, lr=1e-3, warmup_steps=0, frozen_steps=5, backbone_lr=0.1, final_fraction=1.0
+            total=20,
+            lr=1e-3,
+            warmup_steps=0,
+            backbone_freeze_steps=5,
+            backbone_lr=0.1,
+            final_fraction=1.0,
         ),
         20,
     )
@@ -201,7 +206,7 @@ def test_backbone_is_frozen_then_follows_at_its_share() -> None:
 @pytest.mark.parametrize("name", ["sgd", "adamw"])
 def test_frozen_backbone_keeps_its_weights(name: Any) -> None:
     torch.manual_seed(0)
-    built = module(total=10, name=name, lr=0.1, frozen_steps=2, warmup_steps=0)
+    built = module(total=10, name=name, lr=0.1, backbone_freeze_steps=2, warmup_steps=0)
     configured = built.configure_optimizers()
     body, other = (
         built.network.backbone.body.layer1[0].conv1.weight,

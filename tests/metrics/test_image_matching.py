@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_train_metrics import detection, square, truth_of
+from test_coco_metrics import detection, square, truth_of
 
 from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
-from cohdc_train.metrics.matching import ImageMatch, confusion_matrix, match_images, ranked
+from cohdc_train.metrics.matching import ImageMatch, best_and_worst, confusion_matrix, match_images
 
 LEFT, RIGHT, EMPTY = [10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0], [10.0, 38.0, 30.0, 58.0]
 LOWER = [10.0, 14.0, 30.0, 34.0]  # overlaps LEFT by 16 of 24 rows
@@ -55,18 +55,18 @@ def test_an_image_scores_iou_over_objects_and_false_detections() -> None:
 
 def test_doubtful_detections_do_not_count() -> None:
     match = only(results_of(two(), [LEFT, RIGHT, EMPTY], [0.9, 0.49, 0.4]))
-    assert (len(match.detections), match.found.tolist()) == (1, [0, -1])
+    assert (len(match.detections), match.detection_of.tolist()) == (1, [0, -1])
 
 
 def test_a_wrong_class_is_a_miss_and_a_false_detection() -> None:
     match = only(results_of(two(second=2), [LEFT, RIGHT], [0.9, 0.8], labels=[0, 2]))
-    assert (match.found.tolist(), match.right.tolist()) == ([0, 1], [True, False])
+    assert (match.detection_of.tolist(), match.is_correct.tolist()) == ([0, 1], [True, False])
     assert match.score == pytest.approx(1 / 3)
 
 
 def test_the_own_class_goes_before_a_surer_other_one() -> None:
     match = only(results_of(two(), [LEFT, LOWER], [0.9, 0.6], labels=[1, 0]))
-    assert match.found.tolist() == [1, -1]
+    assert match.detection_of.tolist() == [1, -1]
     assert match.score == pytest.approx((2 / 3) / 3)
 
 
@@ -75,7 +75,7 @@ def test_what_lies_in_a_crowd_is_left_out() -> None:
     truth["annotations"][1]["iscrowd"] = 1
     match = only(results_of(truth, [RIGHT, LEFT], [0.9, 0.8]))
     assert (len(match.objects), len(match.crowds), len(match.detections)) == (1, 1, 1)
-    assert match.found.tolist() == [0]
+    assert match.detection_of.tolist() == [0]
     assert match.score == pytest.approx(1.0)
     other = only(results_of(truth, [RIGHT, LEFT], [0.9, 0.8], labels=[1, 0]))
     assert len(other.detections) == 2, "a car among a crowd of people is a false one"
@@ -106,7 +106,7 @@ def test_ranking_takes_no_image_twice_and_no_image_without_a_score() -> None:
     found = ImageMatch(
         5, [{"category_id": 1}], [], [{"category_id": 1}], np.array([0]), np.array([[0.8]])
     )
-    best, worst = ranked([empty, missed, crowded, false, found], 2)
+    best, worst = best_and_worst([empty, missed, crowded, false, found], 2)
     assert [m.image_id for m in best] == [5, 4]
     assert [m.image_id for m in worst] == [3, 2]
-    assert [[m.image_id for m in part] for part in ranked([found, empty], 6)] == [[5], [5]]
+    assert [[m.image_id for m in part] for part in best_and_worst([found, empty], 6)] == [[5], [5]]

@@ -64,7 +64,7 @@ def file(network: MaskRCNN, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_network_finds_what_the_file_finds(network: MaskRCNN, file: Path) -> None:
     module = module_of(network.config, ["person", "car"])
-    assert module.take_over(file) == []
+    assert module.load_pretrained(file) == []
     (expected,), (found,) = detect(network, [IMAGE]), detect(module.network, [IMAGE])
     assert len(expected["scores"]) >= 3
     for name, values in expected.items():
@@ -78,8 +78,8 @@ def test_quantised_weights_come_back_within_their_step(
     small = tmp_path / "model.int8.onnx"
     quantize(file, small, drawn_images(2))
     exact, rounded = (module_of(network.config, ["person", "car"]) for _ in range(2))
-    exact.take_over(file)
-    assert rounded.take_over(small) == []
+    exact.load_pretrained(file)
+    assert rounded.load_pretrained(small) == []
     for (name, one), other in zip(
         exact.network.named_parameters(), rounded.network.parameters(), strict=True
     ):
@@ -89,7 +89,7 @@ def test_quantised_weights_come_back_within_their_step(
 
 def test_other_classes_keep_what_decides_between_them(network: MaskRCNN, file: Path) -> None:
     module = module_of(network.config, ["robot"])
-    left = module.take_over(file)
+    left = module.load_pretrained(file)
     assert {name.rsplit(".", 2)[-2] for name in left} == {
         "cls_score",
         "bbox_pred",
@@ -115,5 +115,5 @@ def test_what_does_not_fit_is_told_in_one_line(
         (tmp_path / "nowhere.onnx", {}, r"nowhere\.onnx: no such file"),
     ):
         with pytest.raises(CohdcError, match=message) as error:
-            module_of(dataclasses.replace(config, **changed), ["person"]).take_over(path)
+            module_of(dataclasses.replace(config, **changed), ["person"]).load_pretrained(path)
         assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Pictures of validations: drawn from toy detections, by a tiny training, and by `cohdc validate`."""
+"""Figures of validations: of toy detections, of a tiny training, and of `cohdc validate`."""
 
 import sys
 from collections.abc import Callable
@@ -13,22 +13,23 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 import coco_toys
-from test_train_cli import TINY
-from test_train_matching import LEFT, LOWER, RIGHT, results_of, two
-from test_train_metrics import SIZE, calibration, random_problem, square, truth_of
+from test_coco_metrics import SIZE, calibration, random_problem, square, truth_of
+from test_fit import TINY
+from test_image_matching import LEFT, LOWER, RIGHT, results_of, two
 
 from cohdc_train.cli import main
 from cohdc_train.data.annotations import CocoImage
 from cohdc_train.files import MANIFEST
-from cohdc_train.metrics.coco_metrics import IOUS, Results, precision_table
-from cohdc_train.train import validation_figures as pictures
+from cohdc_train.metrics.average_precision import IOUS, precision_table
+from cohdc_train.metrics.coco_metrics import Results
+from cohdc_train.train import validation_figures as figures
 from cohdc_train.train.cli import FitCommand, fit
-from cohdc_train.train.validation_figures import ValidationPictures, draw_validation
+from cohdc_train.train.training_plots import plot_log
+from cohdc_train.train.validation_figures import ValidationFigures, draw_validation
 from cohdc_train.train.validation_plots import (
     class_names,
     plot_calibration,
     plot_confusion,
-    plot_log,
     plot_precision_recall,
 )
 
@@ -37,7 +38,7 @@ VALIDATION = {"best.jpg", "worst.jpg", "pr_curves.png", "calibration.png", "conf
 
 
 def seen(content: bytes) -> Any:
-    """The picture, decoded; it must be of a sensible size and show something."""
+    """Decode a figure; it must be of a sensible size and show something."""
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     assert min(image.shape[:2]) >= 300
@@ -135,12 +136,12 @@ def test_missed_and_false_are_red_and_found_is_not(tmp_path: Path) -> None:
         results = results_of(two(), boxes, [0.9] * len(boxes))
         b, g, r = (
             channel.astype(int)
-            for channel in cv2.split(seen(draw_validation(results, [grey])["best.jpg"]))
+            for channel in cv2.split(seen(draw_validation(results, [gray])["best.jpg"]))
         )
         return int(((r > b + 60) & (r > g + 60)).sum())
 
-    grey = photograph(tmp_path, 7)
-    cv2.imwrite(str(grey.path), np.full((*SIZE, 3), 100, np.uint8))
+    gray = photograph(tmp_path, 7)
+    cv2.imwrite(str(gray.path), np.full((*SIZE, 3), 100, np.uint8))
     assert reds([LEFT, RIGHT]) == 0
     assert reds([LEFT]) > 1000
     assert reds([LEFT, RIGHT, [10.0, 38.0, 30.0, 58.0]]) > 1000
@@ -214,9 +215,7 @@ def trained(toy: Path) -> Callable[..., Path]:
     return train
 
 
-def test_a_fit_and_a_validation_leave_their_pictures(
-    toy: Path, trained: Callable[..., Path]
-) -> None:
+def test_fit_and_validate_write_their_figures(toy: Path, trained: Callable[..., Path]) -> None:
     run = trained("run")
     folders = {
         run / "pictures": {*VALIDATION, "losses.png", "last"},
@@ -250,52 +249,52 @@ def test_a_fit_and_a_validation_leave_their_pictures(
         (["--pictures=true", "--trainer.fast_dev_run=true"], False),
     ],
 )
-def test_pictures_are_drawn_unless_switched_off(
+def test_figures_are_drawn_unless_switched_off(
     toy: Path, more: list[str], drawn: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(toy)
     monkeypatch.setattr(FitCommand, "run", lambda self: None)
     Path("off.yaml").write_text("pictures: false\n")
     trainer = fit(["--config", "tiny.yaml", f"--data.root={toy}", f"--out={toy / 'off'}", *more])
-    hooks = [hook for hook in trainer.callbacks if isinstance(hook, ValidationPictures)]  # type: ignore[attr-defined]
+    hooks = [hook for hook in trainer.callbacks if isinstance(hook, ValidationFigures)]  # type: ignore[attr-defined]
     assert [hook.folder for hook in hooks] == [toy / "off" / "pictures"] * drawn
 
 
-def test_the_best_validations_pictures_stay_and_the_last_ones_are_beside_them(
+def test_figures_of_best_and_last_validation_are_kept(
     trained: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[int] = []
 
     def draw(*_: object) -> dict[str, bytes]:
         drawn.append(len(drawn))
-        return {"picture.txt": str(drawn[-1]).encode()}
+        return {"figure.txt": str(drawn[-1]).encode()}
 
-    monkeypatch.setattr(pictures, "draw_validation", draw)
+    monkeypatch.setattr(figures, "draw_validation", draw)
     # at this rate no epoch scores better than the first; Lightning's trial validation is not drawn
     folder = (
         trained("standstill", "--trainer.max_epochs=2", "--model.optimizer.lr=1e-12", *SHORT)
         / "pictures"
     )
-    assert [(folder / name).read_text() for name in ("picture.txt", "last/picture.txt")] == [
+    assert [(folder / name).read_text() for name in ("figure.txt", "last/figure.txt")] == [
         "0",
         "1",
     ]
 
 
-def test_what_cannot_be_drawn_is_told_and_the_training_goes_on(
+def test_failed_figure_warns_and_training_continues(
     trained: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr(pictures, "draw_validation", fail)
-    with pytest.warns(UserWarning, match=r"(?s)the training goes on.*Traceback.*no ink"):
+    monkeypatch.setattr(figures, "draw_validation", fail)
+    with pytest.warns(UserWarning, match=r"(?s)the training continues.*Traceback.*no ink"):
         run = trained("inkless", *SHORT)
     assert torch.load(run / "last.ckpt", weights_only=True)["global_step"] == 1
 
 
 def test_other_processes_and_trials_draw_nothing(tmp_path: Path) -> None:
-    hook = ValidationPictures(tmp_path)
+    hook = ValidationFigures(tmp_path)
     for first, trial in ((False, False), (True, True)):
         trainer: Any = SimpleNamespace(is_global_zero=first, sanity_checking=trial)
         hook.on_validation_end(trainer, None)  # type: ignore[arg-type]

@@ -43,7 +43,7 @@ def test_the_worst_batch_has_the_most_objects_and_fills_the_canvas(toy: Path) ->
     [(10, 14, 30, 6), (10, 14, 10, 1), (10, 14, 9, 0), (10, 10, 12, 3), (10, 30, 29, 1)],
 )
 def test_how_many_fit(one: float, two: float, budget: float, room: int) -> None:
-    assert batch_size.fitting(one, two, budget) == room
+    assert batch_size.max_batch_size(one, two, budget) == room
 
 
 @pytest.mark.skipif(not batch_size._RESET.exists(), reason="needs Linux to tell its memory")
@@ -55,7 +55,9 @@ def test_a_larger_canvas_leaves_room_for_fewer_images(
     for side in (256, 1024):
         built = module((side, side))
         before = {name: value.clone() for name, value in built.network.state_dict().items()}
-        found[side] = batch_size.largest_batch(built, CocoDataModule(toy, canvas=(side, side)), CPU)
+        found[side] = batch_size.find_batch_size(
+            built, CocoDataModule(toy, canvas=(side, side)), CPU
+        )
         assert all(
             torch.equal(before[name], value) for name, value in built.network.state_dict().items()
         )
@@ -66,4 +68,4 @@ def test_a_larger_canvas_leaves_room_for_fewer_images(
 def test_too_little_memory_is_told(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_size, "_free", lambda device: 2**20)
     with pytest.raises(CohdcError, match="batch_size auto: one image takes"):
-        batch_size.largest_batch(module((256, 256)), CocoDataModule(toy, canvas=(256, 256)), CPU)
+        batch_size.find_batch_size(module((256, 256)), CocoDataModule(toy, canvas=(256, 256)), CPU)
