@@ -3,11 +3,13 @@
 import json
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser
 
+from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path
 from cohdc_train.train.checkpoints import BEST_DEFAULTS
 
@@ -21,6 +23,8 @@ DESCRIPTION = (
 )
 DEFAULT_NETWORK = "networks/hdc_net_n.yaml"
 _NETWORK_NAMES = ("backbone", "depth")  # fields that say which network is meant
+_CONFIG_OPTIONS = ("--config", "-c")
+_RENAMED = {"model.optimizer.frozen_steps": "model.optimizer.backbone_freeze_steps"}
 
 
 def add_fit_arguments(parser: LightningArgumentParser) -> None:
@@ -82,9 +86,13 @@ def resolve_arguments(args: list[str]) -> list[str]:
     """Turn leading folders into `--data.root`, and names of shipped configs into their files.
 
     Where neither a config nor an option names a network, the default network comes first.
+
+    Raises:
+        CohdcError: an option has been renamed; the message says to what.
     """
     num_roots = next((i for i, arg in enumerate(args) if arg.startswith("-")), len(args))
     roots, options = args[:num_roots], args[num_roots:]
+    _check_renamed(options)
     resolved: list[str] = []
     if not names_network(options):
         resolved += ["--config", str(config_path(DEFAULT_NETWORK))]
@@ -92,7 +100,7 @@ def resolve_arguments(args: list[str]) -> list[str]:
         resolved.append(f"--data.root={roots[0] if len(roots) == 1 else json.dumps(roots)}")
     for arg in options:
         name, separator, value = arg.partition("=")
-        if resolved and resolved[-1] in ("--config", "-c"):
+        if resolved and resolved[-1] in _CONFIG_OPTIONS:
             arg = str(config_path(arg))
         elif name == "--config" and separator:
             arg = f"{name}={config_path(value)}"
@@ -105,12 +113,32 @@ def names_network(args: list[str]) -> bool:
     options = tuple(f"--model.network.{name}" for name in _NETWORK_NAMES)
     if any(arg.startswith(options) for arg in args):
         return True
-    paths = [following for arg, following in pairwise(args) if arg in ("--config", "-c")]
-    paths += [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
-    return any(_has_network(config_path(path)) for path in paths)
+    networks = [_value_at(content, "model.network") for _, content in _configs(args)]
+    return any(name in (network or {}) for network in networks for name in _NETWORK_NAMES)
 
 
-def _has_network(path: Path) -> bool:
-    content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    network = (content.get("model") or {}).get("network") or {}
-    return any(name in network for name in _NETWORK_NAMES)
+def _check_renamed(args: list[str]) -> None:
+    """Raise CohdcError for an option, or a key of a config, that has another name now."""
+    for old, new in _RENAMED.items():
+        if any(arg.partition("=")[0] == f"--{old}" for arg in args):
+            raise CohdcError(f"--{old} is now --{new}")
+        section, _, key = old.rpartition(".")
+        for path, content in _configs(args):
+            if key in (_value_at(content, section) or {}):
+                raise CohdcError(f"{path}: {old} is now {new}")
+
+
+def _configs(args: list[str]) -> list[tuple[Path, dict[str, Any]]]:
+    """Return path and content of each config behind `--config`."""
+    names = [following for arg, following in pairwise(args) if arg in _CONFIG_OPTIONS]
+    names += [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
+    paths = [config_path(name) for name in names]
+    return [(path, yaml.safe_load(path.read_text(encoding="utf-8")) or {}) for path in paths]
+
+
+def _value_at(content: dict[str, Any], section: str) -> Any:
+    """Return the section of a config such as "model.network"; None where it is missing."""
+    value: Any = content
+    for name in section.split("."):
+        value = value.get(name) if isinstance(value, dict) else None
+    return value

@@ -43,8 +43,9 @@ def row_of(mask: NDArray[np.uint8], **more: Any) -> dict[str, Any]:
 
 
 def random_problem(seed: int) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Ground truth with crowd, classes without objects and images without objects, and jittered
-    detections.
+    """Make ground truth and jittered detections.
+
+    There is a crowd, a class without objects and an image without objects.
     """
     rng = np.random.default_rng(seed)
     truth: dict[str, Any] = {
@@ -100,8 +101,9 @@ def test_average_precision_equals_pycocotools(seed: int, kind: Any) -> None:
 
 
 def band(mask: NDArray[np.uint8], width: int) -> NDArray[np.bool_]:
-    """The pixels of a mask that have one outside of it, or the picture's edge, within `width` rows
-    and columns.
+    """Return the pixels of a mask near one outside of it, or near the image's edge.
+
+    width: rows and columns that are near.
     """
     inner = np.ones(mask.shape, np.bool_)
     padded = np.pad(mask, width)
@@ -186,7 +188,7 @@ def test_perfect_and_missed_objects() -> None:
     assert (scores["mIoU"], scores["S90_matched"], scores["S90_all"]) == (0.5, 1.0, 0.5)
 
 
-def test_the_next_epoch_is_scored_like_the_first_one() -> None:
+def test_next_epoch_scores_like_the_first() -> None:
     truth = truth_of(square(10, 10, 20), square(50, 10, 20))
     metrics, fresh = SegmentationMetrics(truth), SegmentationMetrics(truth)
     metrics.update(7, detection([[10, 10, 30, 30]], [0.9], [1.0]))
@@ -211,7 +213,7 @@ def test_rescoring_ranks_masks_by_quality_and_leaves_boxes() -> None:
     assert scores[True]["box_AP"] == scores[False]["box_AP"] == pytest.approx(0.5)
 
 
-def test_the_filter_leaves_out_what_quality_doubts() -> None:
+def test_quality_filter_drops_detections() -> None:
     boxes = [[10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0]]
     found = []
     for least in (0.0, 0.9):
@@ -224,7 +226,7 @@ def test_the_filter_leaves_out_what_quality_doubts() -> None:
     assert [scores["box_AP"] for scores in found] == pytest.approx([1.0, 51 / 101])
 
 
-def test_a_detection_takes_one_object_and_the_better_score_goes_first() -> None:
+def test_detection_matches_one_object_best_score_first() -> None:
     truth = truth_of(square(10, 10, 20))
     rows = [row_of(square(10, 10, 20), image_id=7, category_id=1, score=0.5)]
     rows.append(
@@ -265,7 +267,7 @@ def test_only_seen_images_count() -> None:
     assert metrics.compute()["segm_AP"] == pytest.approx(1.0)
 
 
-def test_encode_keeps_the_best_hundred_and_pastes_masks() -> None:
+def test_encoding_keeps_the_best_hundred_and_pastes_masks() -> None:
     boxes = [[10.0, 10.0, 30.0, 30.0]] * 120
     rows = encode_detections(7, SIZE, detection(boxes, [i / 120 for i in range(120)], [1.0] * 120))
     assert len(rows) == 100

@@ -8,7 +8,7 @@ import torch
 from cohdc_train.metrics import coco_metrics as metrics
 
 
-def test_images_that_two_processes_saw_count_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_seen_by_two_processes_count_once(monkeypatch: pytest.MonkeyPatch) -> None:
     def gather(parts: list[Any], mine: Any) -> None:
         parts[:] = [mine, {2: [{"image_id": 2}], 3: []}]
 

@@ -1,4 +1,4 @@
-"""Who found whom, on squares whose answers are worked out by hand."""
+"""Matches of objects and detections, on squares whose answers are worked out by hand."""
 
 from typing import Any
 
@@ -17,8 +17,9 @@ LOWER = [10.0, 14.0, 30.0, 34.0]  # overlaps LEFT by 16 of 24 rows
 def results_of(
     truth: dict[str, Any], boxes: Any, scores: Any, labels: Any = None, quality: Any = None
 ) -> Results:
-    """Detections that fill their boxes, in image 7. labels: 0-based, of the first class unless
-    given.
+    """Score detections that fill their boxes, in image 7.
+
+    labels: 0-based, of the first class unless given.
     """
     names = [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}, {"id": 3, "name": "dog"}]
     metrics = SegmentationMetrics({**truth, "categories": names})
@@ -30,7 +31,7 @@ def results_of(
 
 
 def two(second: int = 1) -> dict[str, Any]:
-    """Squares at LEFT and at RIGHT; the class of the one on the right."""
+    """Return squares at LEFT and at RIGHT; second: class of the one on the right."""
     truth = truth_of(square(10, 10, 20), square(50, 10, 20))
     truth["annotations"][1]["category_id"] = second
     return truth
@@ -41,7 +42,7 @@ def only(results: Results) -> ImageMatch:
     return match
 
 
-def test_an_image_scores_iou_over_objects_and_false_detections() -> None:
+def test_image_scores_iou_over_objects_and_false_detections() -> None:
     assert only(results_of(two(), [LEFT, RIGHT], [0.9, 0.9])).score == pytest.approx(1.0)
     assert only(results_of(two(), [LEFT], [0.9])).score == pytest.approx(1 / 2)
     assert only(results_of(two(), [LOWER, RIGHT, EMPTY], [0.9, 0.8, 0.7])).score == pytest.approx(
@@ -58,19 +59,19 @@ def test_doubtful_detections_do_not_count() -> None:
     assert (len(match.detections), match.detection_of.tolist()) == (1, [0, -1])
 
 
-def test_a_wrong_class_is_a_miss_and_a_false_detection() -> None:
+def test_wrong_class_is_a_miss_and_a_false_detection() -> None:
     match = only(results_of(two(second=2), [LEFT, RIGHT], [0.9, 0.8], labels=[0, 2]))
     assert (match.detection_of.tolist(), match.is_correct.tolist()) == ([0, 1], [True, False])
     assert match.score == pytest.approx(1 / 3)
 
 
-def test_the_own_class_goes_before_a_surer_other_one() -> None:
+def test_own_class_matches_before_a_higher_score() -> None:
     match = only(results_of(two(), [LEFT, LOWER], [0.9, 0.6], labels=[1, 0]))
     assert match.detection_of.tolist() == [1, -1]
     assert match.score == pytest.approx((2 / 3) / 3)
 
 
-def test_what_lies_in_a_crowd_is_left_out() -> None:
+def test_detections_in_a_crowd_are_dropped() -> None:
     truth = two()
     truth["annotations"][1]["iscrowd"] = 1
     match = only(results_of(truth, [RIGHT, LEFT], [0.9, 0.8]))
@@ -94,7 +95,7 @@ def test_confusion_counts_hits_misses_false_ones_and_other_classes() -> None:
     assert (nothing[0, 3], nothing[1, 3], nothing.sum()) == (1, 1, 2)
 
 
-def test_ranking_takes_no_image_twice_and_no_image_without_a_score() -> None:
+def test_ranking_has_no_image_twice_and_none_without_score() -> None:
     def match(image_id: int, objects: int, false: int) -> ImageMatch:
         rows = [{"category_id": 1}] * objects
         found = np.full(objects, -1, np.int64)

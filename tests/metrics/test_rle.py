@@ -1,6 +1,4 @@
-"""Run lengths made of windows against pycocotools' of whole masks, and boundaries against
-faster-coco-eval's.
-"""
+"""Run lengths of windows against pycocotools, and boundaries against faster-coco-eval."""
 
 import cv2
 import numpy as np
@@ -38,7 +36,7 @@ def random_window(seed: int) -> tuple[NDArray[np.bool_], int, int]:
 
 @given(SEEDS)
 @settings(max_examples=300, deadline=None)
-def test_a_windows_run_lengths_are_the_whole_masks(seed: int) -> None:
+def test_window_rle_equals_rle_of_whole_mask(seed: int) -> None:
     window, top, left = random_window(seed)
     mask = np.zeros(SIZE, np.bool_)
     mask[top : top + window.shape[0], left : left + window.shape[1]] = window
@@ -47,7 +45,7 @@ def test_a_windows_run_lengths_are_the_whole_masks(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=100, deadline=None)
-def test_boundaries_are_those_of_faster_coco_eval(seed: int) -> None:
+def test_boundaries_equal_faster_coco_eval(seed: int) -> None:
     """Of the window and of the whole mask; blobs that leave the image among them."""
     rng = np.random.default_rng(seed)
     canvas = np.zeros(SIZE, np.uint8)
@@ -75,6 +73,6 @@ def test_polygons_have_boundaries_too() -> None:
     )  # 2 % of the diagonal are 2 px
 
 
-def test_an_empty_mask_has_an_empty_boundary() -> None:
+def test_empty_mask_has_an_empty_boundary() -> None:
     nothing = whole_rle(np.zeros(SIZE, np.bool_))
     assert boundary_rle(nothing, SIZE) == nothing

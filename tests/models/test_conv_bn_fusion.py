@@ -1,6 +1,4 @@
-"""The copy that validation runs: the same detections, no norm left, and nothing of it in the
-network it was made of.
-"""
+"""The copy that validation runs: equal detections, no norm left, and the network unchanged."""
 
 import copy
 
@@ -52,7 +50,7 @@ def network_of(shape, norm):
 
 @pytest.mark.parametrize("norm", ["batch", "frozen"])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_it_finds_what_the_network_finds(shape, norm):
+def test_fused_network_detects_the_same(shape, norm):
     network = network_of(shape, norm)
     images = [
         torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8),
@@ -67,7 +65,7 @@ def test_it_finds_what_the_network_finds(shape, norm):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_weights_in_bfloat16_are_those_that_autocast_makes(shape):
+def test_bfloat16_weights_equal_autocast(shape):
     network = network_of(shape, "batch")
     images = [torch.randint(0, 256, (3, 90, 120), dtype=torch.uint8)]
     with torch.autocast("cpu", torch.bfloat16):
@@ -79,7 +77,7 @@ def test_weights_in_bfloat16_are_those_that_autocast_makes(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_every_norm_is_folded_and_the_network_keeps_its_own(shape):
+def test_all_norms_are_folded_and_the_network_is_unchanged(shape):
     network = network_of(shape, "batch")
     before = {name: value.clone() for name, value in network.state_dict().items()}
     copied = fuse_conv_bn(network)

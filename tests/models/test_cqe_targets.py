@@ -24,35 +24,33 @@ def _scene(rows=slice(20, 60), columns=slice(10, 50)):
     return truth
 
 
-def test_a_perfect_mask_in_a_tight_box_has_quality_one():
+def test_perfect_mask_in_a_tight_box_has_quality_one():
     box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_truth_outside_the_box_counts():
-    """The box holds half of the object and the mask fills it: IoU 1/2 with the whole, though 1
-    inside the box.
-    """
+    """Check a box on half of the object, filled by the mask: IoU 1/2 with the whole object."""
     box = torch.tensor([[10.0, 20.0, 30.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_mask_larger_than_the_object_is_punished():
+def test_mask_larger_than_the_object_is_punished():
     box = torch.tensor([[10.0, 20.0, 90.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(0.5, abs=0.02)
 
 
-def test_an_empty_mask_has_quality_zero():
+def test_empty_mask_has_quality_zero():
     box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
     assert (
         cqe_targets(torch.zeros(1, 28, 28), box, _true(_scene()), torch.tensor([0])).item() == 0.0
     )
 
 
-def test_each_box_is_held_against_its_own_object():
+def test_each_box_is_compared_with_its_object():
     truth = torch.cat([_scene(), _scene(slice(60, 100), slice(60, 100))])
     boxes = torch.tensor([[60.0, 60.0, 100.0, 100.0], [10.0, 20.0, 50.0, 60.0]])
     target = cqe_targets(torch.ones(2, 28, 28), boxes, _true(truth), torch.tensor([1, 0]))
@@ -122,7 +120,7 @@ def _drawn(rectangles, size=(48, 64)):
 
 @settings(max_examples=60, deadline=None)
 @given(blobs, blobs)
-def test_boundary_iou_is_what_boundary_ap_counts(one, other):
+def test_boundary_iou_equals_faster_coco_eval(one, other):
     a, b = _drawn(one), _drawn(other)
     bands = [
         oracle.rleToBoundary(oracle.encode(np.asfortranarray(m.numpy(), dtype=np.uint8)))
@@ -132,7 +130,7 @@ def test_boundary_iou_is_what_boundary_ap_counts(one, other):
     assert boundary_iou(a, b, boundary_band_px(48, 64)).item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_edge_of_the_image_is_contour():
+def test_image_edge_is_contour():
     half = _drawn([(0, 0, 48, 32)])
     inner = _drawn([(2, 2, 44, 28)])
     assert boundary_iou(half, half & ~inner, 2).item() == 1.0
@@ -158,7 +156,7 @@ def _laid_over(mask, box, size):
     st.integers(0, 99),
 )
 @example(rectangles=[(17, 1, 31, 2)], corner=(0.0, 18.0), extent=(4.0, 31.0), seed=2)
-def test_targets_on_the_canvas_are_those_of_the_pasted_mask(rectangles, corner, extent, seed):
+def test_canvas_targets_equal_those_of_pasted_masks(rectangles, corner, extent, seed):
     """Compare the targets with the masks that `encode_detections` pastes and Boundary AP scores.
 
     The box leaves the canvas.
@@ -198,7 +196,7 @@ def _mini(mask, side=56):
     return GroundTruthMasks.from_target({"masks": rasters, "frames": frame}, torch.tensor([0]))
 
 
-def test_a_mini_mask_stands_for_the_whole_one():
+def test_mini_mask_replaces_the_whole_one():
     y, x = torch.meshgrid(torch.arange(200), torch.arange(240), indexing="ij")
     disc = ((x - 100) ** 2 + (y - 90) ** 2 < 70**2) | ((x - 170).abs() + (y - 140).abs() < 40)
     box, matched = torch.tensor([[20.0, 30.0, 190.0, 170.0]]), torch.tensor([0])

@@ -9,7 +9,7 @@ from cohdc_train.models.ops import nms_keep, nms_keep_batched
 
 @settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**31), images=st.integers(1, 5), count=st.integers(1, 60))
-def test_suppressing_all_images_at_once_keeps_what_one_after_the_other_does(seed, images, count):
+def test_batched_suppression_equals_image_by_image(seed, images, count):
     generator = torch.Generator().manual_seed(seed)
     corner = torch.rand(images, count, 2, generator=generator) * 500
     boxes = torch.cat(

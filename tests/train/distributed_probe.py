@@ -1,6 +1,4 @@
-"""What the tests of distributed training put into `cohdc fit`: a callback that writes down what
-each rank saw.
-"""
+"""Callback for the tests of distributed training, which writes down what each rank saw."""
 
 from pathlib import Path
 from typing import Any
@@ -85,7 +83,7 @@ def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
 def _keep_own_gradients(
     state: Any, bucket: torch.distributed.GradBucket
 ) -> torch.futures.Future[Tensor]:
-    """A communication hook that does not communicate."""
+    """Replace the communication of gradients by none."""
     kept: torch.futures.Future[Tensor] = torch.futures.Future()
     kept.set_result(bucket.buffer())
     return kept

@@ -1,13 +1,10 @@
 """The largest batch: worst images, extrapolation, and a real measurement of this process."""
 
-import sys
 from pathlib import Path
 
+import coco_toys
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
-import coco_toys
 
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
@@ -30,7 +27,7 @@ def module(canvas: tuple[int, int]) -> MaskRCNNModule:
     )
 
 
-def test_the_worst_batch_has_the_most_objects_and_fills_the_canvas(toy: Path) -> None:
+def test_worst_batch_has_the_most_objects_and_fills_the_canvas(toy: Path) -> None:
     batch = batch_size.worst_batch(CocoDataModule(toy, canvas=(96, 128), mini_mask=(28, 28)), 3)
     assert batch.images.shape == (3, 3, 96, 128)
     assert [t["masks"].shape for t in batch.targets] == [(2, 28, 28)] * 3
@@ -42,14 +39,14 @@ def test_the_worst_batch_has_the_most_objects_and_fills_the_canvas(toy: Path) ->
     ("one", "two", "budget", "room"),
     [(10, 14, 30, 6), (10, 14, 10, 1), (10, 14, 9, 0), (10, 10, 12, 3), (10, 30, 29, 1)],
 )
-def test_how_many_fit(one: float, two: float, budget: float, room: int) -> None:
+def test_batch_size_is_extrapolated_from_one_and_two_images(
+    one: float, two: float, budget: float, room: int
+) -> None:
     assert batch_size.max_batch_size(one, two, budget) == room
 
 
 @pytest.mark.skipif(not batch_size._RESET.exists(), reason="needs Linux to tell its memory")
-def test_a_larger_canvas_leaves_room_for_fewer_images(
-    toy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_larger_canvas_fits_fewer_images(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_size, "_free", lambda device: 2**30)
     found = {}
     for side in (256, 1024):
@@ -65,7 +62,7 @@ def test_a_larger_canvas_leaves_room_for_fewer_images(
     assert found[1024] < found[256]
 
 
-def test_too_little_memory_is_told(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_an_error(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_size, "_free", lambda device: 2**20)
     with pytest.raises(CohdcError, match="batch_size auto: one image takes"):
         batch_size.find_batch_size(module((256, 256)), CocoDataModule(toy, canvas=(256, 256)), CPU)

@@ -6,12 +6,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import coco_toys
 import pytest
 import torch
 import yaml
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
-import coco_toys
 
 HERE = Path(__file__).parent
 TIMEOUT_S = (
@@ -49,8 +47,9 @@ EXACT: dict[str, Any] = {
 
 
 def folder(root: Path, boxes: dict[str, list[tuple[tuple[int, int], ...]]]) -> Path:
-    """Toy images with a person and a car of 12 px each; boxes: split -> per image the corners of
-    its objects.
+    """Write toy images with a person and a car of 12 px each.
+
+    boxes: by split, per image the corners of its objects.
     """
     for split, images in boxes.items():
         files, rows = [], []
@@ -110,7 +109,7 @@ def fit(
 
 
 def curve(ranks: list[dict[str, Any]]) -> torch.Tensor:
-    """[steps] the loss, mean over the ranks."""
+    """Return [steps] the loss, mean over the ranks."""
     return torch.tensor([rank["losses"] for rank in ranks]).mean(dim=0)
 
 
@@ -134,7 +133,7 @@ def two(root: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_two_processes_have_the_loss_curve_of_one_with_twice_the_batch(one: Any, two: Any) -> None:
+def test_two_processes_equal_one_with_twice_the_batch(one: Any, two: Any) -> None:
     losses = curve(one)
     assert len(losses) == STEPS
     assert losses[-1] < 0.9 * losses[0]
@@ -159,10 +158,8 @@ def test_validation_counts_every_image_once(one: Any, two: Any) -> None:
 
 
 @pytest.mark.slow
-def test_gradients_that_are_not_averaged_show(root: Path, one: Any) -> None:
-    """The comparison above has teeth: with the fault planted, the first loss is the same and the
-    later ones are not.
-    """
+def test_gradients_that_are_not_averaged_are_detected(root: Path, one: Any) -> None:
+    """Plant the fault: the first loss is equal and the later ones are not."""
     apart = fit(root, root / "apart", processes=2, batch_size=2, apart=True)
     off = (curve(apart) / curve(one) - 1).abs()
     assert off[0] < TOLERANCE
@@ -174,7 +171,7 @@ def test_gradients_that_are_not_averaged_show(root: Path, one: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_rank_without_an_object_finishes(tmp_path: Path) -> None:
+def test_rank_without_an_object_finishes(tmp_path: Path) -> None:
     """One of two images has no object; every step, one of the two processes has nothing to find."""
     boxes = {"train": [((4, 8), (40, 20)), ()], "val": [((4, 8), (40, 20))]}
     ranks = fit(folder(tmp_path, boxes), tmp_path / "out", processes=2, batch_size=1)

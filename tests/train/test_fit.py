@@ -2,19 +2,16 @@
 
 import json
 import re
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
 
+import coco_toys
 import pytest
 import torch
 import yaml
 from lightning.pytorch.utilities import rank_zero_info
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
-import coco_toys
 
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError
@@ -82,7 +79,7 @@ def test_saved_configuration_repeats_the_training(toy: Path, run: Path) -> None:
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
-def test_a_checkpoint_loads_without_the_weights_it_started_from(run: Path) -> None:
+def test_checkpoint_loads_without_its_initial_weights(run: Path) -> None:
     checkpoint = torch.load(run / "best.ckpt", weights_only=True)
     checkpoint["hyper_parameters"]["network"]["weights"] = "/not/there.pt"
     torch.save(checkpoint, run / "moved.ckpt")
@@ -106,7 +103,7 @@ def test_load_refuses_other_files_in_one_line(tmp_path: Path, content: bytes | N
     assert "\n" not in str(error.value)
 
 
-def test_the_last_checkpoint_is_of_the_last_epoch_even_when_an_earlier_one_is_best(
+def test_last_checkpoint_is_of_the_last_epoch(
     toy: Path,
 ) -> None:
     out = toy / "standstill"  # at this rate no epoch scores better than the first
@@ -242,7 +239,7 @@ def test_other_classes_load_all_but_class_layers(run: Path) -> None:
         assert all(torch.equal(new[name], own[name] if name in left else old[name]) for name in new)
 
 
-def test_a_checkpoint_without_a_fitting_weight_is_refused(run: Path) -> None:
+def test_checkpoint_without_a_fitting_weight_is_refused(run: Path) -> None:
     other = NetworkConfig(
         depth=50, width=0.25, fpn_channels=16, fc=32, anchor_scales=(8, 16, 32, 64)
     )
@@ -283,14 +280,14 @@ def test_half_precision_trains(toy: Path) -> None:
     assert trainer.global_step == 2
 
 
-def test_a_diverged_loss_names_step_and_images(toy: Path) -> None:
+def test_diverged_loss_names_step_and_images(toy: Path) -> None:
     with pytest.raises(
         CohdcError, match=r"^step \d+: the loss is not finite on images \d+, \d+:.*lower the lr$"
     ):
         fit(arguments(toy, toy / "nan", "--model.optimizer.lr=1e30", "--trainer.max_epochs=5"))
 
 
-def test_an_unreadable_image_is_told_in_one_line_from_a_worker(tmp_path: Path) -> None:
+def test_unreadable_image_in_a_worker_is_one_line(tmp_path: Path) -> None:
     root = coco_toys.folder(tmp_path)
     (root / "tiny.yaml").write_text(TINY, encoding="utf-8")
     for path in (root / "images").glob("train_*"):
@@ -314,7 +311,7 @@ def test_an_unreadable_image_is_told_in_one_line_from_a_worker(tmp_path: Path) -
         (["--config=table3/test99.yaml"], "test99.yaml"),
     ],
 )
-def test_bad_values_are_told_in_one_line(
+def test_bad_values_are_one_line(
     toy: Path, more: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["fit", *arguments(toy, toy / "bad", *more)]) == 1
@@ -323,10 +320,24 @@ def test_bad_values_are_told_in_one_line(
     assert message in last
 
 
+def test_renamed_option_names_the_new_one(
+    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = "model.optimizer.frozen_steps", "model.optimizer.backbone_freeze_steps"
+    config = tmp_path / "old.yaml"
+    config.write_text("model: {optimizer: {frozen_steps: 3}}")
+    assert main(["fit", *arguments(toy, toy / "bad", f"--{old}=3")]) == 1
+    assert main(["fit", *arguments(toy, toy / "bad", f"--config={config}")]) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        f"cohdc fit: --{old} is now --{new}",
+        f"cohdc fit: {config}: {old} is now {new}",
+    ]
+
+
 @pytest.mark.parametrize(
     "wrong", ["--data.rot=x", "--model.network.canvas=[1,2]", "--data.batch_size=two"]
 )
-def test_a_wrong_key_or_type_is_a_usage_error(toy: Path, wrong: str) -> None:
+def test_wrong_key_or_type_is_a_usage_error(toy: Path, wrong: str) -> None:
     with pytest.raises(SystemExit) as stop:
         fit(arguments(toy, toy / "bad", wrong))
     assert stop.value.code == 2
@@ -353,12 +364,8 @@ def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> 
     assert shown["pictures"] is True
 
 
-def test_an_average_of_the_weights_is_validated_and_kept(
-    toy: Path, run: Path, tmp_path: Path
-) -> None:
-    """Another network than the last step's, which is kept beside it so that a resume goes on from
-    there.
-    """
+def test_weight_average_is_validated_and_kept(toy: Path, run: Path, tmp_path: Path) -> None:
+    """Check that best.ckpt has the average, and keeps the plain weights for a resume."""
     fit(arguments(toy, tmp_path, "--ema=0.99"))
     checkpoint = torch.load(tmp_path / "best.ckpt", weights_only=True)
     plain = torch.load(run / "best.ckpt", weights_only=True)
@@ -378,7 +385,7 @@ def test_an_average_of_the_weights_is_validated_and_kept(
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 1
 
 
-def test_a_decay_of_one_is_refused(toy: Path, tmp_path: Path) -> None:
+def test_decay_of_one_is_refused(toy: Path, tmp_path: Path) -> None:
     with pytest.raises(CohdcError, match="ema 1"):
         fit(arguments(toy, tmp_path, "--ema=1.0"))
 
@@ -405,9 +412,7 @@ def test_validate_keeps_figures_it_did_not_write(
     assert (tmp_path / "best.jpg").read_text() == "mine"
 
 
-def test_the_batch_size_is_found(
-    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_batch_size_is_found(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fit(arguments(toy, tmp_path, "--data.batch_size=auto", "--data.mini_mask=[28,28]"))
     assert "batch size: 32" in capsys.readouterr().out
     with pytest.raises(CohdcError, match="works on one device"):
@@ -416,9 +421,7 @@ def test_the_batch_size_is_found(
 
 @pytest.mark.slow
 def test_two_images_are_learned(tmp_path: Path) -> None:
-    """Trained and scored on the same two images, every object is found: the whole way from JSON to
-    AP is sound.
-    """
+    """Train and score on two images: all objects are found, so the way from JSON to AP is sound."""
     root = coco_toys.folder(tmp_path, train=2)
     (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
     same = [
@@ -457,7 +460,7 @@ def test_two_images_are_learned(tmp_path: Path) -> None:
         ("two lines\nwithout a name", "without a name"),
     ],
 )
-def test_error_is_told_by_its_last_line(text: str, told: str) -> None:
+def test_error_of_several_lines_becomes_its_last(text: str, told: str) -> None:
     with pytest.raises(CohdcError) as error, user_errors():
         raise CohdcError(text)
     assert str(error.value) == told

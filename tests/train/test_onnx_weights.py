@@ -22,7 +22,7 @@ IMAGE = torch.from_numpy(drawn_images(1)[0]).permute(2, 0, 1)
 
 
 def trained(config: NetworkConfig) -> MaskRCNN:
-    """A network whose frozen norms do something."""
+    """Return a network whose frozen norms do something."""
     torch.manual_seed(0)
     network = MaskRCNN(2, config).eval()
     for module in network.modules():
@@ -62,7 +62,7 @@ def file(network: MaskRCNN, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_network_finds_what_the_file_finds(network: MaskRCNN, file: Path) -> None:
+def test_loaded_network_detects_what_the_file_detects(network: MaskRCNN, file: Path) -> None:
     module = module_of(network.config, ["person", "car"])
     assert module.load_pretrained(file) == []
     (expected,), (found,) = detect(network, [IMAGE]), detect(module.network, [IMAGE])
@@ -72,7 +72,7 @@ def test_the_network_finds_what_the_file_finds(network: MaskRCNN, file: Path) ->
 
 
 @pytest.mark.slow
-def test_quantised_weights_come_back_within_their_step(
+def test_quantized_weights_load_within_their_step(
     network: MaskRCNN, file: Path, tmp_path: Path
 ) -> None:
     small = tmp_path / "model.int8.onnx"
@@ -87,7 +87,7 @@ def test_quantised_weights_come_back_within_their_step(
         assert (one - other).abs().max() <= 0.51 * step + 1e-6, name
 
 
-def test_other_classes_keep_what_decides_between_them(network: MaskRCNN, file: Path) -> None:
+def test_other_classes_keep_their_class_layers(network: MaskRCNN, file: Path) -> None:
     module = module_of(network.config, ["robot"])
     left = module.load_pretrained(file)
     assert {name.rsplit(".", 2)[-2] for name in left} == {
@@ -98,9 +98,7 @@ def test_other_classes_keep_what_decides_between_them(network: MaskRCNN, file: P
     }
 
 
-def test_what_does_not_fit_is_told_in_one_line(
-    network: MaskRCNN, file: Path, tmp_path: Path
-) -> None:
+def test_file_that_does_not_fit_is_one_line(network: MaskRCNN, file: Path, tmp_path: Path) -> None:
     config = network.config
     (garbage := tmp_path / "garbage.onnx").write_bytes(b"no graph")
     for path, changed, message in (

@@ -103,7 +103,7 @@ def test_frozen_stages_are_not_optimized() -> None:
     assert id(built.network.backbone.body.conv1.weight) not in optimized
 
 
-def test_a_schedule_without_an_end_is_refused() -> None:
+def test_schedule_without_an_end_is_refused() -> None:
     with pytest.raises(CohdcError, match="--minutes"):
         module(total=float("inf")).configure_optimizers()
 
@@ -141,7 +141,7 @@ def test_rate_follows_the_clock_where_time_ends_the_training(
     assert all(body == pytest.approx(0.5 * heads) for heads, _, body, *_ in rates)
 
 
-def test_progress_is_the_further_of_steps_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_elapsed_fraction_is_the_larger_of_steps_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Timer, "time_elapsed", lambda self, stage="train": 30.0)
     options = {
         "accelerator": "cpu",
@@ -223,7 +223,7 @@ def test_frozen_backbone_keeps_its_weights(name: Any) -> None:
     assert moved == [(False, True), (False, True), (True, True)]
 
 
-def test_resumed_schedule_goes_on_at_the_same_rates() -> None:
+def test_resumed_schedule_has_the_same_rates() -> None:
     def built() -> tuple[Any, Any]:
         configured = module(total=20, lr=1e-3).configure_optimizers()
         return configured["optimizer"], configured["lr_scheduler"]["scheduler"]

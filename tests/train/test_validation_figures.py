@@ -1,18 +1,15 @@
 """Figures of validations: of toy detections, of a tiny training, and of `cohdc validate`."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import coco_toys
 import cv2
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
-import coco_toys
 from test_coco_metrics import SIZE, calibration, random_problem, square, truth_of
 from test_fit import TINY
 from test_image_matching import LEFT, LOWER, RIGHT, results_of, two
@@ -55,7 +52,7 @@ def photograph(folder: Path, image_id: int, size: tuple[int, int] = SIZE) -> Coc
     return CocoImage(image_id, path, *size, ())
 
 
-def test_precision_is_cocos_at_both_ious() -> None:
+def test_precision_curves_equal_coco() -> None:
     boxes = [
         LEFT,
         [10.0, 38.0, 30.0, 58.0],
@@ -88,7 +85,7 @@ def test_precision_is_cocos_at_both_ious() -> None:
         "false only",
     ],
 )
-def test_a_validation_is_drawn_whatever_it_found(
+def test_validation_with_any_detections_is_drawn(
     truth: Any, boxes: Any, quality: Any, tmp_path: Path
 ) -> None:
     results = results_of(
@@ -131,7 +128,7 @@ def rest(results: Results) -> tuple[Any, ...]:
     return results.rows, results.kept, results.precision, results.scores
 
 
-def test_missed_and_false_are_red_and_found_is_not(tmp_path: Path) -> None:
+def test_missed_and_false_are_red(tmp_path: Path) -> None:
     def reds(boxes: list[list[float]]) -> int:
         results = results_of(two(), boxes, [0.9] * len(boxes))
         b, g, r = (
@@ -147,7 +144,7 @@ def test_missed_and_false_are_red_and_found_is_not(tmp_path: Path) -> None:
     assert reds([LEFT, RIGHT, [10.0, 38.0, 30.0, 58.0]]) > 1000
 
 
-def test_the_calibrations_title_tells_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_title_of_calibration_has_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
     from matplotlib.axes import Axes
 
     titles: list[str] = []
@@ -178,7 +175,7 @@ def test_many_classes_with_odd_names_are_drawn(classes: int) -> None:
     seen(plot_confusion(counts, class_names(truth)))
 
 
-def test_a_log_with_gaps_nan_and_zeros_is_drawn(tmp_path: Path) -> None:
+def test_log_with_gaps_nan_and_zeros_is_drawn(tmp_path: Path) -> None:
     log = tmp_path / "metrics.csv"
     log.write_text(
         "epoch,lr-AdamW,step,train/loss,train/mask,val/mIoU,val/segm_AP,val/segm_AP/car\n"
