@@ -156,10 +156,11 @@ class CocoDataModule(pl.LightningDataModule):
             self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
             if self.overfit:
                 usable = train[0].with_objects()
-                if self.overfit > len(usable.images):
+                num_usable = len(usable.images)
+                if self.overfit > num_usable:
                     raise DataError(
-                        f"--overfit {self.overfit}: {usable.annotations} has "
-                        f"{len(usable.images)} training images with objects; give at most so many"
+                        f"--overfit {self.overfit}: {usable.annotations} has {num_usable} training "
+                        f"images with objects; give at most {num_usable}"
                     )
                 same = usable.subset(self.overfit)
                 self._folder = CocoFolder((same,), same)

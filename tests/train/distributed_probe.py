@@ -51,9 +51,7 @@ class Probe(pl.Callback):
 
 
 def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
-    """One detection per color of the toy images, off by an amount that follows from the image's
-    pixels.
-    """
+    """Return one detection per color of the toy images, off by what their pixels determine."""
     found = []
     for image in images:
         boxes, labels = [], []

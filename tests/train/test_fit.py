@@ -16,6 +16,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError
 from cohdc_train.models import NetworkConfig
+from cohdc_train.train import progress
 from cohdc_train.train.cli import fit
 from cohdc_train.train.messages import user_errors
 from cohdc_train.train.module import MaskRCNNModule
@@ -670,7 +671,7 @@ def test_overfit_on_more_images_than_there_are_is_refused(
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == (
         f"cohdc fit: --overfit 1000: {toy / 'instances_train.json'} has 6 training images with "
-        "objects; give at most so many"
+        "objects; give at most 6"
     )
 
 
@@ -683,3 +684,16 @@ def test_closing_lines_state_the_time_to_the_first_step_and_between_epochs(
     assert re.fullmatch(
         r"time: \d+\.\d s to the first step, \d+\.\d s between epochs \(without validation\)", line
     )
+
+
+def test_training_without_a_bar_prints_its_steps(
+    toy: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_INTERVAL_S", 0.0)
+    fit(arguments(toy, tmp_path, "--trainer.limit_val_batches=0"))
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("step ")]
+    assert [line.partition(";")[0] for line in lines] == ["step 1", "step 2", "step 3"]
+    assert all(re.search(r"\d images, .*; loss .*; lr .* min", line) for line in lines)
