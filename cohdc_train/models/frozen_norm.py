@@ -39,7 +39,7 @@ class FoldingConv2d(nn.Conv2d):
     names and values.
     """
 
-    norms: list[FrozenNorm]  # one; a list, so that it is no submodule of this too
+    norms: list[FrozenNorm]  # one norm, in a list, so that it is no submodule here
 
     def forward(self, x: Tensor) -> Tensor:
         """Convolve and normalize x [B, C, H, W]."""

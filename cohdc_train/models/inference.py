@@ -14,7 +14,7 @@ from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels, rows_to
 from cohdc_train.models.rpn import decode, is_nonempty
 
 _CANDIDATES = 1000  # best (proposal, class) pairs that enter the last suppression
-_LEAST_IOU = 0.25  # that a mask is cut by: at a probability of 0.2
+_MIN_IOU = 0.25  # lowest IoU estimate that a mask is cut by, at a probability of 0.2
 
 
 @dataclass(frozen=True)
@@ -188,5 +188,5 @@ def cut_by_quality(masks: Tensor, quality: Tensor) -> Tensor:
 
     masks: [n, M, M] probabilities; quality: [n] estimates q of the IoU.
     """
-    ratio = quality.clamp(min=_LEAST_IOU)[:, None, None]
+    ratio = quality.clamp(min=_MIN_IOU)[:, None, None]
     return masks / (masks + ratio * (1.0 - masks))

@@ -10,10 +10,8 @@ from torch import Tensor
 from torchvision.ops import nms, roi_align
 
 SAMPLING_RATIO = 2
-CANONICAL_SIDE, CANONICAL_LEVEL = (
-    224,
-    4,
-)  # FPN's rule: a 224 px box is pooled from level 4 (stride 16)
+# FPN's rule: a box of 224 px is pooled from level 4 (stride 16).
+CANONICAL_SIDE, CANONICAL_LEVEL = 224, 4
 
 
 def fitted_size(height: int, width: int, canvas: tuple[int, int]) -> tuple[int, int]:

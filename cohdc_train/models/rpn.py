@@ -11,6 +11,7 @@ from torchvision.models.detection.rpn import RegionProposalNetwork, RPNHead
 from cohdc_train.models.ops import nms_keep
 
 _NMS_IOU = 0.7
+_MAX_LOG_GROWTH = 4.135  # a box grows at most 1000 / 16 times
 _MIN_SIDE = 1e-2  # px on the canvas; smaller boxes hold nothing
 # Share of a background anchor or proposal inside a crowd box from which it is no negative.
 _CROWD_OVERLAP = 0.5
@@ -166,9 +167,8 @@ def decode(deltas: Tensor, boxes: Tensor, weights: tuple[float, ...], limit: Ten
     center = boxes[:, :, :2] + 0.5 * size
     shift = deltas * deltas.new_tensor([1.0 / weight for weight in weights])
     center = center + shift[:, :, :2] * size
-    half = (
-        0.5 * torch.exp(shift[:, :, 2:].clamp(max=4.135)) * size
-    )  # at most 1000 / 16 times as large
+    growth = shift[:, :, 2:].clamp(max=_MAX_LOG_GROWTH)
+    half = 0.5 * torch.exp(growth) * size
     corners = torch.cat([center - half, center + half], dim=2)
     return torch.minimum(corners.clamp(min=0.0), limit)
 

@@ -12,7 +12,7 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.models import MaskRCNN
 from cohdc_train.train.module import MaskRCNNModule
 
-MAX_BATCH_SIZE = 32  # more makes no step faster
+MAX_BATCH_SIZE = 32  # images; larger batches make no step faster
 _SHARE = {"cuda": 0.85, "cpu": 0.5}  # of the memory that is free before the first step
 _STATUS, _MEMORY, _RESET = (
     Path("/proc") / p for p in ("self/status", "meminfo", "self/clear_refs")

@@ -4,11 +4,11 @@ import math
 from datetime import timedelta
 from typing import Any
 
-IMAGES = 6000  # that a training without a budget sees at least
-EPOCHS = (12, 300)  # and fewest and most epochs of it
-VALIDATIONS = (2, 8)  # fewest and most of a training that time ends
-_VALIDATION_MINUTES = 5.0  # between them, within those limits
-_VALIDATIONS = 4  # of a training that steps or epochs end
+IMAGES = 6000  # least number of images that a training without a budget sees
+EPOCHS = (12, 300)  # fewest and most epochs of a training without a budget
+VALIDATIONS = (2, 8)  # fewest and most validations of a training that time ends
+_VALIDATION_MINUTES = 5.0  # between the validations of such a training, within those limits
+_VALIDATIONS = 4  # validations of a training that steps or epochs end
 
 
 def training_limits(

@@ -1,4 +1,4 @@
-"""Lines that `cohdc fit` prints, Lightning's that it drops, and errors told in one line."""
+"""Lines that `cohdc fit` prints, Lightning's that it drops, and errors of one line."""
 
 import logging
 import warnings

@@ -104,7 +104,7 @@ def _read_layers(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:
     for node in model.graph.node:
         if node.op_type in _OPERATORS:
             weights, *biases = (_value(name, tensors, makers) for name in node.input[1:3])
-            bias = biases[0] if biases else torch.zeros(())  # one that was all zeros is left out
+            bias = biases[0] if biases else torch.zeros(())  # the export drops a bias of zeros
             found[_key(node.input[1])] = weights, bias
     return found
 

@@ -16,7 +16,7 @@ from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.optimizer import ElapsedFraction
 
 _WINDOW = 30  # steps over which speed and loss are averaged
-_MAX_CLASSES = 5  # whose AP stands in the line
+_MAX_CLASSES = 5  # with their AP in the line
 _FIGURE = "worst.jpg"  # validation figure that goes to TensorBoard
 _LINE_INTERVAL_S = 60.0  # between lines on the steps, where there is no progress bar
 

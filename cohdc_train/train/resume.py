@@ -11,9 +11,9 @@ from cohdc_train.errors import CohdcError
 from cohdc_train.train.initial_weights import SHAPE_FIELDS
 from cohdc_train.train.optimizer import option_name
 
-KEY = "fit_options"  # of a checkpoint: options that its hyper-parameters do not hold
+KEY = "fit_options"  # key in checkpoints of options that are no hyper-parameters
 _WEIGHT_FIELDS = (*SHAPE_FIELDS, "norm", "frozen_stages")  # decide which weights are trained
-_RESTORED_FIELDS = ("lr", "weight_decay", "momentum")  # come back with the optimizer's state
+_RESTORED_FIELDS = ("lr", "weight_decay", "momentum")  # part of the optimizer's state
 _AVERAGE = "current_model_state"  # Lightning's key for the plain weights of an averaged training
 
 
@@ -106,7 +106,7 @@ def _option_notes(checkpoint: Mapping[str, Any], options: Mapping[str, Any]) -> 
     was_averaged, is_averaged = _AVERAGE in checkpoint, bool(options["ema"])
     before = stored.get("ema", "on" if was_averaged else 0.0)
     if was_averaged and not is_averaged:
-        used = "the training goes on from the average, without one"
+        used = "the training continues from the average, without a new one"
         yield _note("--ema", before, options["ema"], used)
     elif is_averaged and not was_averaged:
         yield _note("--ema", before, options["ema"], "the average starts at the checkpoint")
