@@ -23,7 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     "contour": set(),
     "trajectory": {"errors"},
     "data": {"images", "presets", "errors"},
-    "synth": {"errors"},
+    "synth": {"data", "slam", "trajectory", "errors"},
     "models": set(),
     "metrics": {"models", "masks"},
     "train": {"data", "models", "metrics", "signature", "presets", "errors"},
@@ -34,7 +34,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "bench": {
         *("validation", "train", "metrics", "data", "models", "exporter", "segmenter"),
-        *("contour", "presets", "errors"),
+        *("contour", "slam", "presets", "errors"),
     },
     "segmenter": {"signature", "masks", "presets", "errors"},
     "prediction": {"segmenter", "contour", "images", "errors"},

@@ -12,7 +12,7 @@ from unittest import mock
 
 import pytest
 
-from cohdc_train.cli import VERBS, main
+from cohdc_train.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -59,7 +59,7 @@ def stilled(component: Any) -> Any:
 
 def check(words: list[str]) -> int:
     """Give a command to `cohdc` without running its verb; returns the exit code."""
-    verb = VERBS.get(words[0]) if words else None
+    verb = COMMANDS.get(words[0]) if words else None
     if verb is None:
         return main(words)
     module = importlib.import_module(f"cohdc_train.{verb.module}")
@@ -70,12 +70,12 @@ def check(words: list[str]) -> int:
         return ended.code if isinstance(ended.code, int) else 2
 
 
-COMMANDS = commands(README)
+README_COMMANDS = commands(README)
 
 
 @pytest.mark.parametrize(
     "words",
-    [words for words in COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
+    [words for words in README_COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
     ids=" ".join,
 )
 def test_command_parses(words: list[str]) -> None:
@@ -84,7 +84,9 @@ def test_command_parses(words: list[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [words for words in COMMANDS if words[:1] in [[v] for v in LIGHTNING]], ids=" ".join
+    "words",
+    [words for words in README_COMMANDS if words[:1] in [[v] for v in LIGHTNING]],
+    ids=" ".join,
 )
 def test_training_command_parses(words: list[str]) -> None:
     done = subprocess.run(

@@ -12,7 +12,7 @@ from typing import Any
 from cohdc_train import __version__, signature
 from cohdc_train.errors import CohdcError, ExportError
 from cohdc_train.exporter.graph import OPSET, count_flops, write_graph
-from cohdc_train.exporter.interleaved_timing import seconds_in_turn
+from cohdc_train.exporter.interleaved_timing import time_interleaved
 from cohdc_train.exporter.parity import TOLERANCES, compare
 from cohdc_train.exporter.quantization import CALIBRATION_IMAGES, quantize
 from cohdc_train.exporter.sample_images import Image, drawn_images, read_images
@@ -110,7 +110,7 @@ def _write_int8(
             "quantised_operators": operators,
         }
         runners = {"float32": Segmenter(target, threads=1), "int8": Segmenter(temporary, threads=1)}
-        taken = seconds_in_turn(runners, list(read_images(calibration, 8)))
+        taken = time_interleaved(runners, list(read_images(calibration, 8)))
         seconds = {kind: statistics.median(times) for kind, times in taken.items()}
         facts["seconds_per_image"] = seconds
         share = seconds["int8"] / seconds["float32"]

@@ -3,8 +3,9 @@ stays cheap.
 """
 
 from cohdc_train.synth.coco import coco
+from cohdc_train.synth.compose import compose
 from cohdc_train.synth.sequence import sequence
 
-COMMANDS = {"coco": coco, "sequence": sequence}
+COMMANDS = {"coco": coco, "sequence": sequence, "compose": compose}
 
-__all__ = ["COMMANDS", "coco", "sequence"]
+__all__ = ["COMMANDS", "coco", "compose", "sequence"]

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 import yaml
 
-from cohdc_train.bench.speed import frame_rates, runners_of
+from cohdc_train.bench.speed import frame_rates, make_runners
 from cohdc_train.exporter.graph import count_flops, write_graph
 from cohdc_train.exporter.quantization import quantize
 from cohdc_train.exporter.sample_images import drawn_images
@@ -106,7 +106,7 @@ def main() -> None:
         costs[name] = count_flops(network)
         files = {"float32": file, "int8": small}
         runners |= {
-            (name, kind): run for kind, run in runners_of(None, files, arguments.threads).items()
+            (name, kind): run for kind, run in make_runners(None, files, arguments.threads).items()
         }
         print(f"{name}: {file.stat().st_size / 1e6:.1f} MB", flush=True)
     rates = frame_rates(runners, pictures)

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 import yaml
 
-from cohdc_train.bench.training import budget, train
+from cohdc_train.bench.training import budget_arguments, train
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.exporter.export import export
 from cohdc_train.files import write_json
@@ -108,7 +108,7 @@ def trained(arguments: argparse.Namespace, data: Path, out: Path, canvas: tuple[
     options = (
         *(f"--config=networks/hdc_net_{arguments.size}.yaml", "--config=person.yaml", start),
         *(f"--seed_everything={arguments.seed}", f"--data.canvas=[{canvas[0]}, {canvas[1]}]"),
-        *budget(arguments.epochs or 28, arguments.minutes),
+        *budget_arguments(arguments.epochs or 28, arguments.minutes),
         *([f"--model.optimizer.lr={arguments.lr}"] if arguments.lr else []),
     )
     checkpoint = train(
