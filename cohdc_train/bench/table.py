@@ -18,8 +18,8 @@ from cohdc_train.data.annotations import read_image
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import claim_folder, write_bytes, write_json, write_text
+from cohdc_train.types import Row
 
-Row = dict[str, Any]
 _FILES = ("table4.json", "table4.csv", "table4.txt", "table4.png", "picture.npy")
 _RATES = ("fps_torch", "fps_ort", "fps_ort_int8")
 _COLUMNS = {
