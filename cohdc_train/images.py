@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
 Size = tuple[int, int]  # width, height, px
 _BROKEN_EXIF = (LookupError, OSError, SyntaxError, TypeError, ValueError, struct.error)
 

@@ -4,15 +4,16 @@ share.
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from cohdc_train.types import Float32Array, Mask
 
 
 def paste_roi_mask(
-    roi_mask: NDArray[np.float32],
-    box: NDArray[np.float32],
+    roi_mask: Float32Array,
+    box: Float32Array,
     size: tuple[int, int],
     threshold: float = 0.5,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """One RoI mask laid over its box in the image: [height, width] bool. See `roi_window`."""
     mask = np.zeros(size, dtype=np.bool_)
     window, (top, left) = roi_window(roi_mask, box, size, threshold)
@@ -21,11 +22,11 @@ def paste_roi_mask(
 
 
 def roi_window(
-    roi_mask: NDArray[np.float32],
-    box: NDArray[np.float32],
+    roi_mask: Float32Array,
+    box: Float32Array,
     size: tuple[int, int],
     threshold: float = 0.5,
-) -> tuple[NDArray[np.bool_], tuple[int, int]]:
+) -> tuple[Mask, tuple[int, int]]:
     """The part of the image's mask that lies in the box: [h, w] bool, and (row, column) of its
     first pixel.
 

@@ -17,16 +17,18 @@ ALLOWED: dict[str, set[str]] = {
     "files": {"errors"},
     "images": set(),
     "signature": set(),
+    "types": set(),
     "masks": set(),
+    "drawing": set(),
     "presets": {"errors"},
     "env": {"errors"},
     "contour": set(),
     "trajectory": {"errors"},
-    "data": {"images", "presets", "errors"},
-    "synth": {"data", "slam", "trajectory", "errors"},
+    "data": {"drawing", "images", "presets", "errors"},
+    "synth": {"contour", "data", "drawing", "slam", "trajectory", "errors"},
     "models": set(),
     "metrics": {"models", "masks"},
-    "train": {"data", "models", "metrics", "signature", "presets", "errors"},
+    "train": {"data", "models", "metrics", "drawing", "signature", "presets", "errors"},
     "validation": {"train", "metrics", "data", "segmenter", "presets", "errors"},
     "exporter": {
         *("validation", "train", "models", "segmenter"),
@@ -37,15 +39,14 @@ ALLOWED: dict[str, set[str]] = {
         *("contour", "slam", "presets", "errors"),
     },
     "segmenter": {"signature", "masks", "presets", "errors"},
-    "prediction": {"segmenter", "contour", "images", "errors"},
-    "slam": {"segmenter", "trajectory", "presets", "errors"},
+    "prediction": {"segmenter", "contour", "drawing", "images", "errors"},
+    "slam": {"segmenter", "trajectory", "drawing", "presets", "errors"},
     "report": {"trajectory", "errors"},
     "cli": {"errors"},  # and any verb's module, by name inside the call
 }
 ALLOWED["demo"] = set(ALLOWED) - {"cli", "__main__"}
-# The program's name and version, and whole-file writing, which import only the errors: any room may
-# use them.
-FREE = {"__init__", "files"}
+# Any room may use the name and version, array types, and whole-file writing, which imports errors.
+FREE = {"__init__", "files", "types"}
 WITHOUT_TORCH = (
     "slam",
     "segmenter",
@@ -54,6 +55,9 @@ WITHOUT_TORCH = (
     "contour",
     "report",
     "env",
+    "types",
+    "drawing",
+    "images",
     "masks",
     "cli",
 )

@@ -7,19 +7,15 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cohdc_train.bench.networks import NetworkBenchOptions
 from cohdc_train.bench.rows import ROWS, ScoredNetwork, row_config, score_model, train_row
 from cohdc_train.bench.speed import Rate, frame_rates, make_runners, median_and_range, peak_memory
-from cohdc_train.bench.table import RATES, TABLE_FILES, Row, write_table
+from cohdc_train.bench.table import RATES, TABLE_FILES, write_table
 from cohdc_train.data.annotations import read_image
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import claim_folder
-
-Image = NDArray[np.uint8]
+from cohdc_train.types import Image, Row
 
 
 def compare_networks(

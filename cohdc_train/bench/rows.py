@@ -10,7 +10,7 @@ from pycocotools import mask as rle
 
 from cohdc_train.bench.networks import NetworkBenchOptions
 from cohdc_train.bench.speed import MIN_SCORE
-from cohdc_train.bench.training import TrainingRun, train
+from cohdc_train.bench.training import train
 from cohdc_train.contour import simplify, trace, vertices
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.exporter.interleaved_timing import Image, K, time_interleaved
+from cohdc_train.exporter.interleaved_timing import K, time_interleaved
 from cohdc_train.models import detect
 from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.types import Image
 
 Runner = Callable[[Image], Detections]
 
@@ -25,6 +26,7 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from cohdc_train.segmenter import Segmenter
+from cohdc_train.types import Image
 run = Segmenter(Path(sys.argv[1]), int(sys.argv[2]))
 image = np.load(sys.argv[3])
 for _ in range(3):

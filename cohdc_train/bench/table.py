@@ -8,8 +8,7 @@ from typing import Any
 
 from cohdc_train.bench.training import markdown_table
 from cohdc_train.files import write_bytes, write_json, write_text
-
-Row = dict[str, Any]
+from cohdc_train.types import Row
 
 TABLE_FILES = ("table4.json", "table4.csv", "table4.txt", "table4.png")
 RATES = ("fps_torch", "fps_ort", "fps_ort_int8")

@@ -12,9 +12,9 @@ from cohdc_train.bench.published import ATE_RMSE, ERRORS, TABLES_5_TO_7
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import sha256, write_json, write_text
 from cohdc_train.presets import model_path
+from cohdc_train.types import Row
 
 MaskMode = Literal["none", "model", "masks"]
-Row = dict[str, Any]
 
 _LISTS = ("rgb.txt", "depth.txt", "groundtruth.txt")
 _SCORES = {"ATE": "ate_m", "RPE 1 s": "rpe_1s_m", "RPE all pairs": "rpe_all_pairs_m"}

@@ -7,7 +7,7 @@ Points are (x, y) in px with the origin at the corner of the first pixel, as COC
 """
 
 from cohdc_train.contour.beetle_search import BeetleSearch
-from cohdc_train.contour.polygons import Polygon, joined, rasterize, trace, vertices
+from cohdc_train.contour.polygons import Polygon, joined, pixel_borders, rasterize, trace, vertices
 from cohdc_train.contour.simplification import METHODS, Method, simplify
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Method",
     "Polygon",
     "joined",
+    "pixel_borders",
     "rasterize",
     "simplify",
     "trace",

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cohdc_train.contour.polygon_iou import Coverage
-from cohdc_train.contour.polygons import FloatArray, IntArray, Polygon, vertices
+from cohdc_train.contour.polygons import Polygon, vertices
+from cohdc_train.types import FloatArray, IntArray
 
 _MOST_VERTICES = 2000  # behind bisection; an outline of more is kept as it is
 _AT_A_TIME = 8  # at first, of so many vertices one is dropped

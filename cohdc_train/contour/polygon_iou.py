@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.contour.polygons import CENTRE, FloatArray, IntArray, Polygon, crossings, edges
+from cohdc_train.contour.polygons import CENTRE, Polygon, crossings, edges
+from cohdc_train.types import FloatArray, Int32Array, IntArray, Mask
 
 _PER_PX = 5  # places for a vertex along a px: one decimal in a file, and the grid that COCO's tools fill on
 
@@ -77,7 +78,7 @@ class Coverage:
         return added
 
     @cached_property
-    def _alone(self) -> NDArray[np.int32]:
+    def _alone(self) -> Int32Array:
         """Rows above every place less twice the outline's pixels above it."""
         hits = np.zeros(self._width * self._rows, np.uint8)
         np.add.at(hits, self._places.astype(np.int64), 1)
@@ -85,7 +86,7 @@ class Coverage:
         alone = np.arange(len(hits), dtype=np.int32)
         alone[1:] -= 2 * np.cumsum(inside[:-1], dtype=np.int32)
         columns = alone.reshape(self._width, self._rows)
-        signed: NDArray[np.int32] = ((columns - columns[:, :1]) * self._sign).ravel()
+        signed: Int32Array = ((columns - columns[:, :1]) * self._sign).ravel()
         return signed
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
@@ -158,11 +159,11 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
     return False
 
 
-def _parted(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> NDArray[np.bool_]:
+def _parted(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> Mask:
     """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different
     sides: [m, n].
     """
     start, along = edges[0, :, None], edges[1, :, None] - edges[0, :, None]
     sides = ((others[:, None] - start) * along.conj()).imag
-    parted: NDArray[np.bool_] = sides[0] * sides[1] < 0
+    parted: Mask = sides[0] * sides[1] < 0
     return parted

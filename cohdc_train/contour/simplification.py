@@ -12,8 +12,9 @@ import numpy as np
 
 from cohdc_train.contour.beetle_search import BeetleSearch, search_vertices
 from cohdc_train.contour.polygon_iou import Coverage
-from cohdc_train.contour.polygons import FloatArray, Polygon, vertices
+from cohdc_train.contour.polygons import Polygon, vertices
 from cohdc_train.contour.tolerance_search import Bracket
+from cohdc_train.types import FloatArray
 
 Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
 METHODS: tuple[Method, ...] = get_args(Method)

@@ -16,6 +16,7 @@ from pycocotools import mask as rle
 from cohdc_train.data.image_files import check_size
 from cohdc_train.errors import DataError
 from cohdc_train.images import read_rgb, size_of
+from cohdc_train.types import Image
 
 _FAR = 1e5  # px from which a coordinate is a mistake; pycocotools draws such polygons point by point until memory ends
 _CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
@@ -67,7 +68,7 @@ class CocoImage:
     objects: tuple[CocoObject, ...]
 
 
-def read_image(image: CocoImage) -> NDArray[np.uint8]:
+def read_image(image: CocoImage) -> Image:
     """Return the image as it was annotated, [height, width, 3] uint8 RGB.
 
     It is upright, turned by its EXIF orientation, unless the annotated size is that of the stored
@@ -109,11 +110,14 @@ def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
             given = rle.frPyObjects(given, image.height, image.width)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: annotation {row.get('id')}: neither polygons nor RLE") from error
-    counts = given["counts"]
-    return {
-        "size": list(given["size"]),
-        "counts": counts.decode() if isinstance(counts, bytes) else counts,
-    }
+    return rle_as_text(given)
+
+
+def rle_as_text(encoded: dict[str, Any]) -> dict[str, Any]:
+    """Return a compressed RLE whose counts are text, as JSON needs them."""
+    counts = encoded["counts"]
+    text = counts.decode() if isinstance(counts, bytes) else counts
+    return {"size": list(encoded["size"]), "counts": text}
 
 
 def fills(counts: str | bytes | list[int], pixels: int) -> bool:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from cohdc_train.errors import DataError
@@ -19,6 +18,7 @@ from cohdc_train.images import (
     turn_upright,
     upright_size,
 )
+from cohdc_train.types import Float32Array
 
 _TAIL = 4096  # bytes at a file's end in which its end mark is looked for
 _END_MARKS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
@@ -94,7 +94,7 @@ def check_size(path: Path, image_id: int, found: Size, annotated: Size) -> None:
         raise DataError(f"{path}: image {image_id} is {sizes}{turned}")
 
 
-def fingerprint(path: Path) -> NDArray[np.float32]:
+def fingerprint(path: Path) -> Float32Array:
     """Return [256] grey values of the upright image at 16x16, of mean 0 and norm 1.
 
     The product of two compares the images. All values are 0 for an image of one grey.
@@ -108,7 +108,7 @@ def fingerprint(path: Path) -> NDArray[np.float32]:
     return values / max(float(np.linalg.norm(values)), 1e-6)
 
 
-def mirrored(prints: NDArray[np.float32]) -> NDArray[np.float32]:
+def mirrored(prints: Float32Array) -> Float32Array:
     """Fingerprints [N, 256] of the same pictures, flipped left to right."""
     return prints.reshape(-1, _SIDE, _SIDE)[:, :, ::-1].reshape(-1, _SIDE * _SIDE)
 

@@ -4,10 +4,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from cohdc_train.types import Image
 
-Image = NDArray[np.uint8]
 K = TypeVar("K")
 
 

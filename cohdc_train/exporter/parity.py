@@ -24,8 +24,7 @@ from cohdc_train.masks import paste_roi_mask
 from cohdc_train.models import Detector, MaskRCNN
 from cohdc_train.models.ops import letterbox
 from cohdc_train.segmenter.segmenter import open_session
-
-Image = NDArray[np.uint8]
+from cohdc_train.types import Image
 
 TOLERANCES = {
     "boxes": 1e-2,

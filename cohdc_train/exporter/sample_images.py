@@ -5,14 +5,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.images import read_rgb
-
-Image = NDArray[np.uint8]
-
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".webp"}
+from cohdc_train.images import IMAGE_SUFFIXES, read_rgb
+from cohdc_train.types import Image
 
 
 def read_images(folder: Path, count: int) -> Iterator[Image]:
@@ -24,7 +20,7 @@ def read_images(folder: Path, count: int) -> Iterator[Image]:
     """
     if not folder.is_dir():
         raise CohdcError(f"{folder}: no such folder")
-    names = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    names = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     if not names:
         raise CohdcError(f"{folder}: 0 images")
     chosen = (

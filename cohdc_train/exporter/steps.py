@@ -15,11 +15,12 @@ from cohdc_train.exporter.graph import OPSET, count_flops, write_graph
 from cohdc_train.exporter.interleaved_timing import time_interleaved
 from cohdc_train.exporter.parity import TOLERANCES, compare
 from cohdc_train.exporter.quantization import CALIBRATION_IMAGES, quantize
-from cohdc_train.exporter.sample_images import Image, drawn_images, read_images
+from cohdc_train.exporter.sample_images import drawn_images, read_images
 from cohdc_train.exporter.scoring import SCORES, Scorer
 from cohdc_train.files import sha256, write_json
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.types import Image
 
 _PARITY_IMAGES = 4
 _MOST_DROP = 0.01  # of mask AP by int8

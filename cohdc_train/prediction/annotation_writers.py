@@ -9,12 +9,12 @@ from typing import Any, Literal, NamedTuple, Protocol, Self
 import yaml
 
 from cohdc_train.contour import Polygon, joined
-from cohdc_train.contour.polygons import FloatArray
+from cohdc_train.drawing import encode_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.files import OwnFiles, write_bytes, write_text
-from cohdc_train.prediction.drawing import jpeg
 from cohdc_train.prediction.image_sources import Picture
 from cohdc_train.segmenter import Detections
+from cohdc_train.types import FloatArray
 
 Format = Literal["coco", "labelme", "yolo"]
 # What a format writes into the output folder, apart from files named after pictures.
@@ -162,7 +162,7 @@ class _Labelme:
         if picture.path is not None:
             path = Path(os.path.relpath(picture.path.resolve(), self._out.resolve())).as_posix()
         else:
-            write_bytes(self._own.path(path), jpeg(picture.rgb))
+            write_bytes(self._own.path(path), encode_jpeg(picture.rgb))
         height, width = one.size
         content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
         content |= {
@@ -226,7 +226,7 @@ class _Yolo:
     def picture(self, picture: Picture, one: Found) -> None:
         if picture.path is None:
             (self._out / "images").mkdir(exist_ok=True)
-            write_bytes(self._own.path(f"images/{picture.name}"), jpeg(picture.rgb))
+            write_bytes(self._own.path(f"images/{picture.name}"), encode_jpeg(picture.rgb))
         elif picture.stem != picture.path.stem:
             raise DataError(
                 f"{picture.path}: another image has this stem, and YOLO labels are found by it"

@@ -5,11 +5,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.contour import Polygon
-from cohdc_train.prediction.image_sources import Image
+from cohdc_train.drawing import fill_mask
 from cohdc_train.segmenter import Detections
+from cohdc_train.types import Image
 
 # RGB; neighbours in the list differ in hue, so that people side by side can be told apart
-_COLOURS = (
+_COLORS = (
     (230, 25, 75),
     (60, 180, 75),
     (0, 130, 200),
@@ -18,7 +19,7 @@ _COLOURS = (
     (70, 240, 240),
     (240, 50, 230),
 )
-_FILL = 0.45  # share of the colour in a filled mask
+_OPACITY = 0.45  # share of the color in a filled mask
 
 
 def draw(rgb: Image, found: Detections, outlines: list[list[Polygon]]) -> Image:
@@ -30,30 +31,29 @@ def draw(rgb: Image, found: Detections, outlines: list[list[Polygon]]) -> Image:
     unit = max(rgb.shape[0], rgb.shape[1]) / 640  # line and letter size grow with the image
     thick = max(1, round(1.5 * unit))
     for row in range(len(found)):
-        colour = _COLOURS[row % len(_COLOURS)]
-        inside = masks[row]
-        canvas[inside] = ((1 - _FILL) * canvas[inside] + _FILL * np.array(colour)).astype(np.uint8)
+        color = _COLORS[row % len(_COLORS)]
+        fill_mask(canvas, masks[row], color, _OPACITY)
         # OpenCV counts from the centre of the first pixel
         rings = [
             np.round(ring - 0.5).astype(np.int32)
             for polygon in outlines[row]
             for ring in polygon.rings
         ]
-        cv2.polylines(canvas, rings, True, colour, thick, cv2.LINE_AA)
+        cv2.polylines(canvas, rings, True, color, thick, cv2.LINE_AA)
     for row in range(len(found)):
         text = f"{found.class_names[found.labels[row]]} {found.scores[row]:.2f} q{found.quality[row]:.2f}"
-        _write_text(canvas, text, found.boxes[row], _COLOURS[row % len(_COLOURS)], 0.45 * unit)
+        _write_text(canvas, text, found.boxes[row], _COLORS[row % len(_COLORS)], 0.45 * unit)
     return canvas
 
 
 def _write_text(
-    canvas: Image, text: str, box: NDArray[np.float32], colour: tuple[int, int, int], scale: float
+    canvas: Image, text: str, box: NDArray[np.float32], color: tuple[int, int, int], scale: float
 ) -> None:
     thick = max(1, round(2 * scale))
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
     x = int(np.clip(box[0], 0, max(canvas.shape[1] - width - 4, 0)))
     y = int(np.clip(box[1], height + 6, max(canvas.shape[0] - 2, height + 6)))
-    cv2.rectangle(canvas, (x, y - height - 6), (x + width + 4, y), colour, -1)
+    cv2.rectangle(canvas, (x, y - height - 6), (x + width + 4, y), color, -1)
     cv2.putText(
         canvas,
         text,
@@ -63,13 +63,4 @@ def _write_text(
         (255, 255, 255),
         thick,
         cv2.LINE_AA,
-    )
-
-
-def jpeg(rgb: Image) -> bytes:
-    """A picture as a JPEG file. rgb: uint8 [H, W, 3]."""
-    return bytes(
-        cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])[
-            1
-        ]
     )

@@ -8,14 +8,11 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
-from cohdc_train.images import read_rgb
+from cohdc_train.images import IMAGE_SUFFIXES, read_rgb
+from cohdc_train.types import Image
 
-Image = NDArray[np.uint8]
-
-IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
 VIDEO_SUFFIXES = frozenset([".mp4", ".avi", ".mkv", ".mov", ".webm"])
 _WEBCAM_FRAMES = 100
 

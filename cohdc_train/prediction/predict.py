@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.contour import Method, Polygon, simplify, trace
+from cohdc_train.drawing import encode_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.files import OwnFiles, claim_folder, write_bytes
 from cohdc_train.prediction.annotation_writers import FILES, Format, Found, coco, open_format
-from cohdc_train.prediction.drawing import draw, jpeg
-from cohdc_train.prediction.image_sources import Image, Picture, read_pictures
+from cohdc_train.prediction.drawing import draw
+from cohdc_train.prediction.image_sources import Picture, read_pictures
 from cohdc_train.segmenter import Detections, Segmenter
+from cohdc_train.types import Image
 
 _VERB = "predict"
 
@@ -134,7 +136,7 @@ def predict_pictures(
                 found = found.select(np.array([bool(outline) for outline in outlines], np.bool_))
                 outlines = [outline for outline in outlines if outline]
                 overlay = own.path(f"{overlays}{picture.stem}_overlay.jpg")
-                write_bytes(overlay, jpeg(draw(picture.rgb, found, outlines)))
+                write_bytes(overlay, encode_jpeg(draw(picture.rgb, found, outlines)))
                 files.picture(picture, one := Found.of(picture, found, outlines))
                 seen.append(one)
         except DataError:

@@ -23,9 +23,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import ContractError
 from cohdc_train.segmenter.detections import Detections
-
-Image = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+from cohdc_train.types import Float32Array, Image
 
 SCORE_THRESHOLD = 0.05  # as in the files of `cohdc export`
 MOST = 100  # detections of an image
@@ -131,7 +129,7 @@ def _by_rank(session: Any) -> list[Any]:
     return sorted(session.get_outputs(), key=lambda out: len(out.shape))
 
 
-def _best(table: Floats, prototypes: int) -> tuple[NDArray[Any], ...]:
+def _best(table: Float32Array, prototypes: int) -> tuple[NDArray[Any], ...]:
     """Boxes xyxy in canvas px, labels, scores and coefficients of candidates [4 + C + P, n] behind
     suppression.
     """
@@ -156,7 +154,7 @@ def _best(table: Floats, prototypes: int) -> tuple[NDArray[Any], ...]:
     )
 
 
-def _last(table: Floats) -> tuple[NDArray[Any], ...]:
+def _last(table: Float32Array) -> tuple[NDArray[Any], ...]:
     """The same of rows [n, 6 + P] that were suppressed in the graph."""
     rows = table[table[:, 4] > SCORE_THRESHOLD]
     rows = rows[np.argsort(-rows[:, 4], kind="stable")][:MOST]
@@ -167,7 +165,7 @@ def _detections(
     boxes: NDArray[Any],
     labels: NDArray[Any],
     scores: NDArray[Any],
-    masks: list[Floats],
+    masks: list[Float32Array],
     size: tuple[int, int],
     names: tuple[str, ...],
 ) -> Detections:
@@ -230,7 +228,7 @@ def _letterbox(rgb: Image, canvas: tuple[int, int]) -> tuple[Image, float, tuple
     return fitted, scale, (left, top)
 
 
-def _cut(field: Floats, box: NDArray[Any]) -> Floats:
+def _cut(field: Float32Array, box: NDArray[Any]) -> Float32Array:
     """[_ROI, _ROI] of a map [h, w] inside a box, in the map's cells: sampled at the centres of a
     grid over it.
     """
@@ -246,5 +244,5 @@ def _cut(field: Floats, box: NDArray[Any]) -> Floats:
     )
 
 
-def _sigmoid(x: NDArray[Any]) -> Floats:
+def _sigmoid(x: NDArray[Any]) -> Float32Array:
     return np.asarray(1 / (1 + np.exp(-np.clip(x, -50, 50))), dtype=np.float32)

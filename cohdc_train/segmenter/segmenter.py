@@ -8,15 +8,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import onnxruntime
-from numpy.typing import NDArray
 
 from cohdc_train import signature
 from cohdc_train.errors import ContractError
 from cohdc_train.presets import model_path, shipped_models
 from cohdc_train.segmenter.adapters import FOREIGN
 from cohdc_train.segmenter.detections import Detections
-
-Image = NDArray[np.uint8]
+from cohdc_train.types import Image
 
 
 class Graph(Protocol):

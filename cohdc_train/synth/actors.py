@@ -5,13 +5,12 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.synth import people as bodies
-from cohdc_train.synth.camera_motion import Doubles
-from cohdc_train.synth.mesh import Floats, Mesh, yaw_rotation
+from cohdc_train.synth.mesh import Mesh, yaw_rotation
 from cohdc_train.synth.textures import Texture
 from cohdc_train.synth.walk_paths import Walk
+from cohdc_train.types import Float32Array, FloatArray
 
 _BLENDS = np.array(
     [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [1 / 3] * 3]
@@ -35,14 +34,14 @@ class Actor(Protocol):
         """Its triangles, world frame, the same ones in the same order in every frame."""
         ...
 
-    def points(self, frame: int) -> NDArray[np.float64]:
+    def points(self, frame: int) -> FloatArray:
         """[n, 3] m about where it is, world frame, cheaper than `mesh`."""
         ...
 
 
-def scattered(mesh: Mesh) -> Doubles:
+def scattered(mesh: Mesh) -> FloatArray:
     """[7 T, 3] points spread over the triangles of `mesh`."""
-    points: Doubles = np.einsum("bk,tki->tbi", _BLENDS, mesh.corners).reshape(-1, 3)
+    points: FloatArray = np.einsum("bk,tki->tbi", _BLENDS, mesh.corners).reshape(-1, 3)
     return points
 
 
@@ -61,7 +60,7 @@ class Walker:
         return self.person.textures
 
     @cached_property
-    def _figure(self) -> Doubles:
+    def _figure(self) -> FloatArray:
         return scattered(bodies.person_mesh(self.person, bodies.walking(0.6), (0.0, 0.0), 0.0))
 
     def mesh(self, frame: int) -> Mesh:
@@ -73,7 +72,7 @@ class Walker:
         x, y = (float(v) for v in self.walk.position[frame])
         return bodies.person_mesh(self.person, pose, (x, y), float(self.walk.heading[frame]))
 
-    def points(self, frame: int) -> Doubles:
+    def points(self, frame: int) -> FloatArray:
         """The person in one pose."""
         return _carried(self._figure, self.walk, frame)
 
@@ -85,8 +84,8 @@ class Sitter:
     person: bodies.Person
     place: tuple[float, float]
     heading: float
-    fidget: Doubles
-    gesture: Doubles
+    fidget: FloatArray
+    gesture: FloatArray
     is_person: bool = True
 
     @property
@@ -100,10 +99,10 @@ class Sitter:
         return bodies.person_mesh(self.person, pose, self.place, self.heading)
 
     @cached_property
-    def _figure(self) -> Doubles:
+    def _figure(self) -> FloatArray:
         return scattered(self.mesh(0))
 
-    def points(self, frame: int) -> Doubles:
+    def points(self, frame: int) -> FloatArray:
         """The seated person, whose fidgeting is no matter here."""
         return self._figure
 
@@ -122,14 +121,14 @@ class Thing:
         place = (*self.walk.position[frame], 0.0)
         return self.body.moved(yaw_rotation(float(self.walk.heading[frame])), place)
 
-    def points(self, frame: int) -> Doubles:
+    def points(self, frame: int) -> FloatArray:
         """The same."""
         return scattered(self.mesh(frame))
 
 
-def _carried(points: Doubles, walk: Walk, frame: int) -> Doubles:
+def _carried(points: FloatArray, walk: Walk, frame: int) -> FloatArray:
     """Points of a body where the walk has got to."""
-    carried: Doubles = points @ yaw_rotation(walk.heading[frame]).T + np.array(
+    carried: FloatArray = points @ yaw_rotation(walk.heading[frame]).T + np.array(
         [*walk.position[frame], 0.0]
     )
     return carried
@@ -140,5 +139,5 @@ def fastest(actor: Actor, frame: int, frames: int, rate: float) -> float:
     end), m/s.
     """
     first = min(frame, frames - 2)
-    step: Floats = actor.mesh(first + 1).corners - actor.mesh(first).corners
+    step: Float32Array = actor.mesh(first + 1).corners - actor.mesh(first).corners
     return float(np.sqrt(np.square(step).sum(axis=2).max())) * rate

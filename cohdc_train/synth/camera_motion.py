@@ -3,9 +3,9 @@
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-Doubles = NDArray[np.float64]
+from cohdc_train.types import FloatArray
+
 CameraMotion = Literal["xyz", "halfsphere", "static", "rpy", "loop"]
 MOTIONS: tuple[str, ...] = get_args(CameraMotion)
 _LOOP_RADIUS = 0.7  # m
@@ -15,20 +15,22 @@ _LEVEL = np.array(
 )  # optical axes (right, down, forward) as columns, looking at +y
 
 
-def sway(rng: np.random.Generator, times: Doubles, amplitude: float, period: float) -> Doubles:
+def sway(
+    rng: np.random.Generator, times: FloatArray, amplitude: float, period: float
+) -> FloatArray:
     """A smooth swing that starts anywhere in its cycle: two sines, the second small and faster."""
     first, second = rng.uniform(0, 2 * np.pi, 2)
     period = period * rng.uniform(0.9, 1.1)
     slow, fast = 2 * np.pi / period, 2 * np.pi / (0.37 * period)
-    swing: Doubles = amplitude * (
+    swing: FloatArray = amplitude * (
         0.9 * np.sin(slow * times + first) + 0.1 * np.sin(fast * times + second)
     )
     return swing
 
 
 def camera_path(
-    rng: np.random.Generator, times: Doubles, motion: CameraMotion, eye: Doubles
-) -> Doubles:
+    rng: np.random.Generator, times: FloatArray, motion: CameraMotion, eye: FloatArray
+) -> FloatArray:
     """[n, 4, 4] T_wc at `times` [n] s, about `eye` [3] m: TUM's four hand motions, and a round of
     the room.
 
@@ -68,18 +70,18 @@ def camera_path(
     return poses
 
 
-def loop_heading(times: Doubles) -> Doubles:
+def loop_heading(times: FloatArray) -> FloatArray:
     """[n] rad to the right of +y that the camera of a loop has turned to at `times`: 0 .. 2 pi,
     slow at both ends.
     """
     done = np.clip((times / times[-1] - _LOOP_START) / (_LOOP_END - _LOOP_START), 0, 1)
-    turned: Doubles = 2 * np.pi * done - 0.6 * np.sin(2 * np.pi * done)
+    turned: FloatArray = 2 * np.pi * done - 0.6 * np.sin(2 * np.pi * done)
     return turned
 
 
-def _euler(angles: Doubles) -> Doubles:
+def _euler(angles: FloatArray) -> FloatArray:
     """[n, 3, 3] rotations by angles [n, 3] about the camera's x (pitch), y (yaw) and z (roll)."""
     from scipy.spatial.transform import Rotation
 
-    matrices: Doubles = Rotation.from_euler("yxz", angles[:, [1, 0, 2]]).as_matrix()
+    matrices: FloatArray = Rotation.from_euler("yxz", angles[:, [1, 0, 2]]).as_matrix()
     return matrices

@@ -3,12 +3,13 @@
 import cv2
 import numpy as np
 
-from cohdc_train.synth.textures import Floats, Texture, colour, flat, noise, write
+from cohdc_train.synth.textures import Texture, colour, flat, noise, write
+from cohdc_train.types import Float32Array
 
 SIDE = 128  # px of a garment's texture
 
 
-def _folds(image: Floats, rng: np.random.Generator, depth: float) -> Texture:
+def _folds(image: Float32Array, rng: np.random.Generator, depth: float) -> Texture:
     """Wrinkles as soft light and dark streaks, and a little weave."""
     streaks = cv2.resize(noise(rng, 32, 32, 4), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
     weave = rng.normal(0, 3, (SIDE, SIDE, 1))
@@ -26,7 +27,7 @@ def cloth(rng: np.random.Generator, patterned: float) -> Texture:
     return _folds(image, rng, 0.09)
 
 
-def _stripes(image: Floats, rng: np.random.Generator) -> None:
+def _stripes(image: Float32Array, rng: np.random.Generator) -> None:
     period = int(rng.integers(8, 32))
     inside = np.arange(SIDE) % period < period * rng.uniform(0.2, 0.6)
     if rng.random() < 0.6:
@@ -35,7 +36,7 @@ def _stripes(image: Floats, rng: np.random.Generator) -> None:
         image[:, inside] = colour(rng, 15, 240)
 
 
-def _checks(image: Floats, rng: np.random.Generator) -> None:
+def _checks(image: Float32Array, rng: np.random.Generator) -> None:
     period = int(rng.integers(8, 28))
     ink = colour(rng, 15, 240)
     line = np.arange(SIDE) % period < period * rng.uniform(0.25, 0.5)
@@ -43,13 +44,13 @@ def _checks(image: Floats, rng: np.random.Generator) -> None:
     image[:, line] = 0.5 * image[:, line] + 0.5 * ink
 
 
-def _dots(image: Floats, rng: np.random.Generator) -> None:
+def _dots(image: Float32Array, rng: np.random.Generator) -> None:
     ink = tuple(float(v) for v in colour(rng, 15, 240))
     for x, y in rng.integers(0, SIDE, (int(rng.integers(30, 90)), 2)):
         cv2.circle(image, (int(x), int(y)), int(rng.integers(1, 5)), ink, -1, cv2.LINE_AA)
 
 
-def _print(image: Floats, rng: np.random.Generator) -> None:
+def _print(image: Float32Array, rng: np.random.Generator) -> None:
     """A motif on the chest (u = 0.5) and on the back (u = 0)."""
     for x in (SIDE // 2, 6):
         for _ in range(5):
@@ -60,7 +61,7 @@ def _print(image: Floats, rng: np.random.Generator) -> None:
         write(image, text, (x - 20, SIDE // 2 + 14), 0.55, colour(rng, 150, 250))
 
 
-def skin_tone(rng: np.random.Generator) -> Floats:
+def skin_tone(rng: np.random.Generator) -> Float32Array:
     """[3] RGB between dark and light skin."""
     light, dark = (
         np.array([236, 196, 170], dtype=np.float32),
@@ -71,12 +72,12 @@ def skin_tone(rng: np.random.Generator) -> Floats:
     )
 
 
-def skin(rng: np.random.Generator, tone: Floats) -> Texture:
+def skin(rng: np.random.Generator, tone: Float32Array) -> Texture:
     """[128, 128, 3] bare skin."""
     return _folds(flat(SIDE, SIDE, tone), rng, 0.03)
 
 
-def face(rng: np.random.Generator, tone: Floats, hair: Floats) -> Texture:
+def face(rng: np.random.Generator, tone: Float32Array, hair: Float32Array) -> Texture:
     """[128, 128, 3] the head's texture; the face looks out at u = 0.5, eyes at v = 0.46, mouth at v
     = 0.66.
     """
@@ -98,19 +99,19 @@ def face(rng: np.random.Generator, tone: Floats, hair: Floats) -> Texture:
     return _folds(image, rng, 0.03)
 
 
-def hair(rng: np.random.Generator, rgb: Floats) -> Texture:
+def hair(rng: np.random.Generator, rgb: Float32Array) -> Texture:
     """[128, 128, 3] strands running down."""
     strands = cv2.resize(rng.normal(0, 16, (4, SIDE)).astype(np.float32), (SIDE, SIDE))
     image: Texture = np.clip(flat(SIDE, SIDE, rgb) + strands[..., None], 0, 255).astype(np.uint8)
     return image
 
 
-def hair_colour(rng: np.random.Generator) -> Floats:
+def hair_colour(rng: np.random.Generator) -> Float32Array:
     """[3] RGB: black, brown, blond, red or grey."""
     known = np.array(
         [[22, 18, 16], [58, 38, 26], [96, 64, 40], [178, 142, 88], [120, 58, 30], [150, 148, 145]]
     )
-    rgb: Floats = np.clip(
+    rgb: Float32Array = np.clip(
         known[int(rng.integers(len(known)))] + rng.normal(0, 8, 3), 5, 230
     ).astype(np.float32)
     return rgb

@@ -7,17 +7,19 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cohdc_train.drawing import write_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder
 from cohdc_train.synth import people as bodies
 from cohdc_train.synth.coco_annotation import annotate
-from cohdc_train.synth.mesh import Floats, join
+from cohdc_train.synth.mesh import join
+from cohdc_train.synth.option_checks import check_size_and_seed
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, Camera, render
 from cohdc_train.synth.room import Lighting, Room, furnished_room, texture_detail
 from cohdc_train.synth.sensor import exposure, photograph, smear
+from cohdc_train.types import Float32Array, FloatArray, Image, Int32Array, Mask
 
 IMAGES_PER_ROOM = 5
 PEOPLE_PER_ROOM = 3
@@ -30,6 +32,7 @@ NEAREST, FARTHEST = (
     6.0,
 )  # m: nearer, the camera would stand in a person; further, people outside of the room
 DISTANCE = (0.7, 3.7)  # m, of people from the camera
+_JPEG_QUALITY = 92
 _COUNT_CHANCE = (0.08, 0.42, 0.34, 0.16)  # of 0, 1, .. 3 people
 
 
@@ -39,8 +42,8 @@ class Picture:
     one.
     """
 
-    image: NDArray[np.uint8]
-    masks: NDArray[np.bool_]
+    image: Image
+    masks: Mask
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def take_picture(
     return Picture(_developed(view.rgb, rng, size), _visible(view.instance, size))
 
 
-def _camera_pose(room: Room, rng: np.random.Generator) -> NDArray[np.float64]:
+def _camera_pose(room: Room, rng: np.random.Generator) -> FloatArray:
     """T_wc of a camera 0.8-1.8 m high in a free spot, looking mostly into the room."""
     from scipy.spatial.transform import Rotation
 
@@ -107,7 +110,7 @@ def _camera_pose(room: Room, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _places(
-    room: Room, rng: np.random.Generator, T_wc: NDArray[np.float64], distances: tuple[float, float]
+    room: Room, rng: np.random.Generator, T_wc: FloatArray, distances: tuple[float, float]
 ) -> list[tuple[float, float]]:
     """Free spots in front of the camera for 0-3 people, the outermost cut by the image's border."""
     wanted = int(rng.choice(len(_COUNT_CHANCE), p=_COUNT_CHANCE))
@@ -138,7 +141,7 @@ def _relit(lighting: Lighting, rng: np.random.Generator) -> Lighting:
     return Lighting(lighting.lamps, lighting.power * gain * tint, lighting.ambient * tint)
 
 
-def _developed(rgb: Floats, rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
+def _developed(rgb: Float32Array, rng: np.random.Generator, size: tuple[int, int]) -> Image:
     """The supersampled rendering as a photograph of `size`: exposure, motion blur in a third,
     optics, noise.
     """
@@ -152,7 +155,7 @@ def _developed(rgb: Floats, rng: np.random.Generator, size: tuple[int, int]) -> 
     return photograph(small, rng, float(rng.uniform(0.5, 3.5)), float(rng.uniform(0, 0.5)))
 
 
-def _visible(instance: NDArray[np.int32], size: tuple[int, int]) -> NDArray[np.bool_]:
+def _visible(instance: Int32Array, size: tuple[int, int]) -> Mask:
     """[n, H, W] who covers at least half of a pixel; no pixel has two owners."""
     masks = []
     free = np.ones(size, dtype=np.bool_)
@@ -206,12 +209,7 @@ def _check(
     for name, number in (("train", train), ("val", val)):
         if number < 1:
             raise DataError(f"{name}: {number} images; a split has at least 1")
-    if min(size) < 48:
-        raise DataError(
-            f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48"
-        )
-    if seed < 0:
-        raise DataError(f"seed: {seed} is negative")
+    check_size_and_seed(size, seed)
     if not NEAREST <= distance[0] <= distance[1] <= FARTHEST:
         raise DataError(
             f"distance: {distance[0]} to {distance[1]} m; needs {NEAREST} <= nearest <= farthest <= {FARTHEST}"
@@ -235,7 +233,7 @@ def _render_split(
         for image_id in range(first + 1, min(first + IMAGES_PER_ROOM, number) + 1):
             picture = take_picture(stage, rng, size, distance)
             name = f"{split}_{image_id:06d}.jpg"
-            _write_jpeg(folder / "images" / name, picture.image)
+            write_jpeg(folder / "images" / name, picture.image, _JPEG_QUALITY)
             images.append({"id": image_id, "file_name": name, "height": size[0], "width": size[1]})
             for mask in picture.masks:
                 crumb = bool(mask.mean() < SMALLEST_SHARE)
@@ -246,10 +244,3 @@ def _render_split(
         "annotations": annotations,
         "categories": [{"id": 1, "name": "person", "supercategory": "person"}],
     }
-
-
-def _write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
-    if not cv2.imwrite(
-        str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]
-    ):
-        raise DataError(f"{path}: cannot be written")

@@ -14,15 +14,11 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder, write_text
 from cohdc_train.synth.sensor import EDGE_DROPOUT, depth_edges
+from cohdc_train.types import Float32Array, FloatArray, Image, Mask
 
 if TYPE_CHECKING:  # loaded when the command runs, so that help stays cheap
     from cohdc_train.slam.geometry.camera import Camera
     from cohdc_train.slam.io.tum import Entry
-
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 
 BODY_WIDTH_M, MAX_HEIGHT_M = 0.6, 1.8  # shoulders with arms, and the tallest person
 HEAD_HEIGHT_M = 1.75  # top of the head above the floor
@@ -44,7 +40,7 @@ class CutOut:
         height: m.
     """
 
-    layers: Floats
+    layers: Float32Array
     width: float
     height: float
 
@@ -76,14 +72,14 @@ class WalkPath:
         phase: rad.
     """
 
-    middle: Doubles
-    along: Doubles
-    facing: Doubles
+    middle: FloatArray
+    along: FloatArray
+    facing: FloatArray
     amplitude: float
     period: float
     phase: float
 
-    def position(self, time: float) -> Doubles:
+    def position(self, time: float) -> FloatArray:
         """Return the point on the floor at a time in s: [3], m."""
         angle = 2 * np.pi * time / self.period + self.phase
         return np.asarray(self.middle + self.along * self.amplitude * np.sin(angle))
@@ -174,10 +170,10 @@ class Recording:
 
     camera: "Camera"
     pairs: "list[tuple[Entry, Entry]]"
-    times: Doubles
-    poses: Doubles
+    times: FloatArray
+    poses: FloatArray
 
-    def frames(self, step: int = 1) -> "Iterator[tuple[tuple[Entry, Entry], Doubles, float]]":
+    def frames(self, step: int = 1) -> "Iterator[tuple[tuple[Entry, Entry], FloatArray, float]]":
         """Iterate over (images, T_wc, time) of every step-th frame."""
         for i in range(0, len(self.pairs), step):
             yield self.pairs[i], self.poses[i], float(self.times[i])
@@ -233,7 +229,7 @@ def cut_out_people(folder: Path, count: int, rng: np.random.Generator) -> list[C
     return cut_outs
 
 
-def pixel_rays(camera: "Camera", step: int) -> Doubles:
+def pixel_rays(camera: "Camera", step: int) -> FloatArray:
     """Return the direction of every step-th pixel with z = 1, undistorted: [H/step, W/step, 3]."""
     x, y = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
     pixels = camera.undistort(np.stack([x.ravel(), y.ravel()], 1).astype(float))
@@ -243,8 +239,8 @@ def pixel_rays(camera: "Camera", step: int) -> Doubles:
 
 
 def render(
-    person: CutOut, path: WalkPath, time: float, T_wc: Doubles, rays: Doubles
-) -> tuple[Floats, Doubles]:
+    person: CutOut, path: WalkPath, time: float, T_wc: FloatArray, rays: FloatArray
+) -> tuple[Float32Array, FloatArray]:
     """Render a person as a camera sees it.
 
     Args:
@@ -306,7 +302,7 @@ def draw_paths(
     raise DataError(f"no walks found on which people cover {wanted}; give another --share")
 
 
-def _draw_path(rng: np.random.Generator, poses: Doubles) -> WalkPath:
+def _draw_path(rng: np.random.Generator, poses: FloatArray) -> WalkPath:
     """Draw a walk across the middle of the camera's view, 0.6 to 1.4 m in front of it."""
     eye = poses[:, :3, 3].mean(0)
     forward = poses[:, :3, 2].mean(0)
@@ -322,8 +318,8 @@ def _draw_path(rng: np.random.Generator, poses: Doubles) -> WalkPath:
 def covered_share(
     people: Sequence[CutOut],
     paths: Sequence[WalkPath],
-    views: Sequence[tuple[float, Doubles, Floats]],
-    rays: Doubles,
+    views: Sequence[tuple[float, FloatArray, Float32Array]],
+    rays: FloatArray,
 ) -> float:
     """Return the mean share of the pixels that people cover.
 
@@ -343,7 +339,7 @@ def covered_share(
     return float(np.mean(covered))
 
 
-def fill_depth(depth: Floats) -> Floats:
+def fill_depth(depth: Float32Array) -> Float32Array:
     """Fill holes with the farthest depth around them; infinite where there is none.
 
     depth: [H, W], m, 0 = no reading.
@@ -355,7 +351,7 @@ def fill_depth(depth: Floats) -> Floats:
 def compose_frame(
     pair: "tuple[Entry, Entry]",
     camera: "Camera",
-    layers: Sequence[tuple[Floats, Doubles]],
+    layers: Sequence[tuple[Float32Array, FloatArray]],
     rng: np.random.Generator,
 ) -> tuple[Image, NDArray[np.uint16], Mask]:
     """Draw people into a frame, the nearest over the others.
@@ -393,8 +389,8 @@ def compose_frame(
 
 
 def _measure_depth(
-    depth: Floats, nearest: NDArray[np.floating], mask: Mask, rng: np.random.Generator
-) -> Floats:
+    depth: Float32Array, nearest: NDArray[np.floating], mask: Mask, rng: np.random.Generator
+) -> Float32Array:
     """Measure the people with the sensor's noise, and drop readings at their outlines."""
     z = np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)
     sigma = 0.0012 + 0.0019 * np.square(z - 0.4)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float32]
+from cohdc_train.types import Float32Array, Int32Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Mesh:
     is in it.
     """
 
-    corners: Floats
-    normals: Floats
-    uv: Floats
-    texture: NDArray[np.int32]
-    instance: NDArray[np.int32]
+    corners: Float32Array
+    normals: Float32Array
+    uv: Float32Array
+    texture: Int32Array
+    instance: Int32Array
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Mesh":
         """The mesh in another frame: rotation [3, 3], translation [3] m."""
@@ -59,13 +59,13 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def yaw_rotation(yaw: float) -> Floats:
+def yaw_rotation(yaw: float) -> Float32Array:
     """[3, 3] rotation by `yaw` rad about the vertical axis z."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=np.float32)
 
 
-def grid(points: Floats, texture: int, closed: bool) -> Mesh:
+def grid(points: Float32Array, texture: int, closed: bool) -> Mesh:
     """The surface through a grid of points, smooth normals.
 
     points: [R, S, 3] m. closed: the last column meets the first (a tube); uv then runs once around
@@ -96,7 +96,7 @@ def grid(points: Floats, texture: int, closed: bool) -> Mesh:
 
 
 @lru_cache(maxsize=32)
-def _topology(rows: int, columns: int) -> tuple[NDArray[np.int64], Floats]:
+def _topology(rows: int, columns: int) -> tuple[IntArray, Float32Array]:
     """Faces [T, 3] over a grid of vertices, and their uv [T, 3, 2]."""
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -107,22 +107,22 @@ def _topology(rows: int, columns: int) -> tuple[NDArray[np.int64], Floats]:
     return faces, np.stack([u, v], -1).reshape(-1, 2)[faces].astype(np.float32)
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit(vectors: Float32Array) -> Float32Array:
     """[n, 3] scaled to length 1."""
-    scaled: Floats = (
+    scaled: Float32Array = (
         vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
     )
     return scaled
 
 
-def _differences(rows: Floats) -> Floats:
+def _differences(rows: Float32Array) -> Float32Array:
     """Central differences along the first axis (one-sided at its ends), up to a factor."""
     padded = np.concatenate([rows[:1], rows, rows[-1:]])
-    differences: Floats = padded[2:] - padded[:-2]
+    differences: Float32Array = padded[2:] - padded[:-2]
     return differences
 
 
-def _cross(a: Floats, b: Floats) -> Floats:
+def _cross(a: Float32Array, b: Float32Array) -> Float32Array:
     return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
@@ -152,7 +152,9 @@ def box(centre: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> 
     return join(faces).moved(yaw_rotation(yaw), centre)
 
 
-def tube(centres: Floats, radii: Floats, side: ArrayLike, texture: int, segments: int = 12) -> Mesh:
+def tube(
+    centres: Float32Array, radii: Float32Array, side: ArrayLike, texture: int, segments: int = 12
+) -> Mesh:
     """A closed tube of elliptic rings.
 
     centres: [R, 3] m; radii: [R, 2] m along `side` (made orthogonal to the tube) and across it.

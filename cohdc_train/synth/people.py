@@ -7,12 +7,12 @@ rad.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.synth import clothes
 from cohdc_train.synth import mesh as solids
 from cohdc_train.synth.mesh import Mesh
 from cohdc_train.synth.textures import Texture
+from cohdc_train.types import Float32Array
 
 SHIRT, TROUSERS, SKIN, FACE, HAIR, SHOES = range(6)  # order of a person's textures
 LEFT = (0.0, 1.0, 0.0)
@@ -141,7 +141,7 @@ def draw_pose(rng: np.random.Generator) -> Pose:
     )
 
 
-def _direction(swing: float, spread: float) -> NDArray[np.float32]:
+def _direction(swing: float, spread: float) -> Float32Array:
     """[3] where a limb points: `swing` forward of straight down, `spread` (signed) towards y."""
     return np.array(
         [np.sin(swing) * np.cos(spread), np.sin(spread), -np.cos(swing) * np.cos(spread)],
@@ -198,7 +198,7 @@ def _leg(person: Person, side: int, hip: float, knee: float) -> tuple[list[Mesh]
     return parts, float(min(heel[2], toe[2]) - 0.024 * h)
 
 
-def _trunk(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
+def _trunk(person: Person, pose: Pose, spine: Float32Array) -> list[Mesh]:
     """Pelvis (or skirt), chest up to the neck."""
     h, g = person.height, person.height * person.girth
     up = np.array([0, 0, 1], dtype=np.float32)
@@ -232,7 +232,7 @@ def _trunk(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]
     return parts
 
 
-def _head(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
+def _head(person: Person, pose: Pose, spine: Float32Array) -> list[Mesh]:
     """Neck, head with its face forward, hair."""
     h = person.height
     neck = 0.305 * h * spine
@@ -255,7 +255,7 @@ def _head(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
 
 
 def _arm(
-    person: Person, spine: NDArray[np.float32], side: int, angles: tuple[float, float, float]
+    person: Person, spine: Float32Array, side: int, angles: tuple[float, float, float]
 ) -> list[Mesh]:
     """Upper arm, forearm and hand; angles: (swing, bend, spread)."""
     h, g = person.height, person.height * person.girth

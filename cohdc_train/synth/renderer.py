@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cohdc_train.synth.mesh import Floats, Mesh
+from cohdc_train.synth.mesh import Mesh
 from cohdc_train.synth.room import Lighting
 from cohdc_train.synth.textures import Texture
+from cohdc_train.types import Float32Array, FloatArray, Int32Array
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Hits:
     barycentric; depth: [N] m;
     directions: [N, 3] world frame."""
 
-    triangle: NDArray[np.int32]
-    weights: Floats
-    depth: Floats
-    directions: Floats
+    triangle: Int32Array
+    weights: Float32Array
+    depth: Float32Array
+    directions: Float32Array
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class View:
     instance: [H, W] int32, 0 = room; facing: [H, W] cosine between the ray and the surface normal.
     """
 
-    rgb: Floats
-    depth: Floats
-    instance: NDArray[np.int32]
-    facing: Floats
+    rgb: Float32Array
+    depth: Float32Array
+    instance: Int32Array
+    facing: Float32Array
 
 
 class Atlas:
@@ -116,8 +116,8 @@ class Atlas:
             ).astype(np.uint8)
 
     def sample(
-        self, texture: NDArray[np.int32], uv: Floats, footprint: Floats, columns: int
-    ) -> Floats:
+        self, texture: Int32Array, uv: Float32Array, footprint: Float32Array, columns: int
+    ) -> Float32Array:
         """[N, 3] float32 0..1 colours. uv: [N, 2]; footprint: [N] texels of the full texture a
         pixel covers.
         """
@@ -131,7 +131,7 @@ class Atlas:
 
 
 @lru_cache(maxsize=4)
-def rays(camera: Camera) -> Floats:
+def rays(camera: Camera) -> Float32Array:
     """[H * W, 3] directions in the camera frame with z = 1, so that a ray's length parameter is the
     depth.
     """
@@ -140,7 +140,7 @@ def rays(camera: Camera) -> Floats:
     return np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
 
 
-def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
+def cast(mesh: Mesh, camera: Camera, T_wc: FloatArray) -> Hits:
     """First hits of all rays of `camera` at `T_wc` [4, 4] (camera to world, m)."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
@@ -154,9 +154,7 @@ def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
     return Hits(found["primID"], weights, found["tfar"], directions)
 
 
-def render(
-    mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: NDArray[np.float64]
-) -> View:
+def render(mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: FloatArray) -> View:
     """Colour, depth and instances of `mesh` seen by `camera` at `T_wc` [4, 4] (camera to world, m)."""
     hits = cast(mesh, camera, T_wc)
     triangle = np.maximum(hits.triangle, 0)
@@ -165,10 +163,12 @@ def render(
     normal = _interpolated(mesh.normals, triangle, hits.weights)
     normal /= np.maximum(np.sqrt(_dot(normal, normal)), np.float32(1e-9))[:, None]
     lengths = np.sqrt(_dot(hits.directions, hits.directions))
-    facing: Floats = np.maximum(-_dot(normal, hits.directions) / lengths, 0)
+    facing: Float32Array = np.maximum(-_dot(normal, hits.directions) / lengths, 0)
     uv = _interpolated(mesh.uv, triangle, hits.weights)
     texels = _density(mesh, atlas)[triangle] / np.sqrt(np.maximum(facing, np.float32(0.1)))
-    footprint: Floats = (depth / np.float32(camera.fx) * texels).astype(np.float32, copy=False)
+    footprint: Float32Array = (depth / np.float32(camera.fx) * texels).astype(
+        np.float32, copy=False
+    )
     albedo = atlas.sample(mesh.texture[triangle], uv, footprint, camera.width)
     position = hits.directions * depth[:, None] + T_wc[:3, 3].astype(np.float32)
     rgb = albedo * _light(position, normal, lighting) * met[:, None]
@@ -179,29 +179,31 @@ def render(
     )
 
 
-def _interpolated(corners: Floats, triangle: NDArray[np.int32], weights: Floats) -> Floats:
+def _interpolated(
+    corners: Float32Array, triangle: Int32Array, weights: Float32Array
+) -> Float32Array:
     """[N, C] a value given at the corners [T, 3, C], at barycentric weights of the second and third
     corner.
     """
     first = corners[:, 0]
     second, third = corners[:, 1] - first, corners[:, 2] - first
-    value: Floats = np.take(first, triangle, axis=0)
+    value: Float32Array = np.take(first, triangle, axis=0)
     value += np.take(second, triangle, axis=0) * weights[:, :1]
     value += np.take(third, triangle, axis=0) * weights[:, 1:]
     return value
 
 
-def _density(mesh: Mesh, atlas: Atlas) -> Floats:
+def _density(mesh: Mesh, atlas: Atlas) -> Float32Array:
     """[T] texels per metre of every triangle."""
     edges = mesh.corners[:, 1:] - mesh.corners[:, :1]
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     spans = (mesh.uv[:, 1:] - mesh.uv[:, :1]) * atlas.size[mesh.texture][:, None]
     texels = np.abs(spans[:, 0, 0] * spans[:, 1, 1] - spans[:, 0, 1] * spans[:, 1, 0])
-    density: Floats = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
+    density: Float32Array = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
     return density
 
 
-def _light(position: Floats, normal: Floats, lighting: Lighting) -> Floats:
+def _light(position: Float32Array, normal: Float32Array, lighting: Lighting) -> Float32Array:
     """[N, 3] light that falls on every point: ambient, stronger from above, and lamps with a
     falloff.
     """
@@ -210,12 +212,12 @@ def _light(position: Floats, normal: Floats, lighting: Lighting) -> Floats:
     square = _dot(position, position)[:, None] - 2 * (position @ lamps) + (lamps * lamps).sum(0)
     square = np.maximum(square, np.float32(1e-4))
     cosine /= np.sqrt(square) * (1 + np.float32(0.12) * square)
-    total: Floats = cosine @ lighting.power
+    total: Float32Array = cosine @ lighting.power
     total += lighting.ambient * (np.float32(0.82) + np.float32(0.18) * normal[:, 2:])
     return total
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
+def _dot(a: Float32Array, b: Float32Array) -> Float32Array:
     """[N] row by row."""
-    product: Floats = np.einsum("ij,ij->i", a, b)
+    product: Float32Array = np.einsum("ij,ij->i", a, b)
     return product

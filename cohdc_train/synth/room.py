@@ -4,21 +4,21 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.synth import mesh as solids
 from cohdc_train.synth import textures
 from cohdc_train.synth.mesh import Mesh
 from cohdc_train.synth.textures import Texture
+from cohdc_train.types import Float32Array, FloatArray
 
 
 @dataclass(frozen=True)
 class Lighting:
     """lamps: [L, 3] m; power: [L, 3] RGB; ambient: [3] RGB. World frame, z up."""
 
-    lamps: NDArray[np.float32]
-    power: NDArray[np.float32]
-    ambient: NDArray[np.float32]
+    lamps: Float32Array
+    power: Float32Array
+    ambient: Float32Array
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Room:
     mesh: Mesh
     textures: tuple[Texture, ...]
     lighting: Lighting
-    footprints: NDArray[np.float32]
+    footprints: Float32Array
 
     def is_free(self, x: float, y: float, radius: float) -> bool:
         """Whether a disc on the floor stays clear of walls and furniture; all in m."""
@@ -154,7 +154,7 @@ class _Builder:
         self.parts.append(solids.join(parts).moved(turn, (x, y, 0.0)))
         self.stand(x, y, size, yaw)
 
-    def thing(self, place: tuple[float, float, float], size: NDArray[np.float64]) -> Mesh:
+    def thing(self, place: tuple[float, float, float], size: FloatArray) -> Mesh:
         """A small box or can."""
         if self.rng.random() < 0.6:
             look = self.face()
@@ -294,7 +294,7 @@ def plain_room(
 
 
 def _shade_floor(
-    floor: Texture, footprints: NDArray[np.float32], size: tuple[float, float, float]
+    floor: Texture, footprints: Float32Array, size: tuple[float, float, float]
 ) -> None:
     """Soft shadows of the furniture, laid over the floor's texture in place."""
     height, width = floor.shape[:2]

@@ -12,12 +12,18 @@ from cohdc_train.synth import furniture
 from cohdc_train.synth import people as bodies
 from cohdc_train.synth import walk_paths as walks
 from cohdc_train.synth.actors import Actor, Sitter, Thing, Walker
-from cohdc_train.synth.camera_motion import CameraMotion, Doubles, camera_path, loop_heading, sway
+from cohdc_train.synth.camera_motion import (
+    CameraMotion,
+    camera_path,
+    loop_heading,
+    sway,
+)
 from cohdc_train.synth.mesh import join
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, Camera, View, render
 from cohdc_train.synth.room import Room, furnished_room, plain_room, round_room, texture_detail
 from cohdc_train.synth.walk_paths import Walk
+from cohdc_train.types import FloatArray
 
 Action = Literal["walk", "stop_and_go", "fill_view", "sit"]
 RATE = 30.0  # frames per second
@@ -77,11 +83,11 @@ class Scene:
     room: Room
     actors: tuple[Actor, ...]
     camera: Camera
-    truth: Doubles
+    truth: FloatArray
     metered: tuple[int, ...] = (0,)
 
     @property
-    def poses(self) -> Doubles:
+    def poses(self) -> FloatArray:
         """[n, 4, 4] T_wc of the frames, m."""
         return self.truth[::TRUTH_PER_FRAME]
 
@@ -105,11 +111,11 @@ class _Stage:
     """What ways are drawn from. times [n] s and poses [n, 4, 4] T_wc of the frames."""
 
     rng: np.random.Generator
-    times: Doubles
-    poses: Doubles
+    times: FloatArray
+    poses: FloatArray
     motion: CameraMotion
 
-    def crowd(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
+    def crowd(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """People who cross the view; in a loop they lead the camera round."""
         if not people:
             return []
@@ -120,19 +126,19 @@ class _Stage:
             ways = tuple(way.moved(0.0, _EYE_Y) for way in ways)
         return [Walker(person, way) for person, way in zip(people, ways, strict=True)]
 
-    def stopping(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
+    def stopping(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """People who stop and go."""
         ways = walks.stop_and_go(self.rng, self.times, distances)
         return [
             Walker(person, way.moved(0.0, _EYE_Y)) for person, way in zip(people, ways, strict=True)
         ]
 
-    def filling(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
+    def filling(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """One before the camera, the others cross behind."""
         first = [Walker(person, walks.approach(self.times, self.poses)) for person in people[:1]]
         return [*first, *self.crowd(people[1:], distances[1:] + 0.6)]
 
-    def seated(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
+    def seated(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """People side by side on chairs, turned to the camera more or less."""
         sitters: list[Actor] = []
         chairs: list[Actor] = []
@@ -264,7 +270,7 @@ def _fitted(draw: Callable[[float], Scene], people: int) -> Scene:
     return best[1]
 
 
-def _coarse_shares(scene: Scene) -> Doubles:
+def _coarse_shares(scene: Scene) -> FloatArray:
     """About the share of the pixels on actors in every sixth frame, from their points on 64 px."""
     camera = scene.camera.resized(64 / scene.camera.width)
     shares = []

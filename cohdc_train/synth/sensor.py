@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.synth.mesh import Floats
 from cohdc_train.synth.renderer import View
+from cohdc_train.types import Float32Array, Image, Mask
 
 DEPTH_SCALE = 5000.0  # TUM: units per metre of the 16 bit files
 NEAR, FAR = 0.4, 5.0  # m, the sensor's range
@@ -15,7 +15,7 @@ RGB_SIGMA = 2.5  # grey levels
 EDGE_DROPOUT = 0.6
 
 
-def exposure(rgb: Floats, brightness: float = 0.37) -> float:
+def exposure(rgb: Float32Array, brightness: float = 0.37) -> float:
     """The factor that brings a rendered image to the mean `brightness` (1 = white), as a camera's
     automatic would.
     """
@@ -23,8 +23,8 @@ def exposure(rgb: Floats, brightness: float = 0.37) -> float:
 
 
 def photograph(
-    rgb: Floats, rng: np.random.Generator, sigma: float = RGB_SIGMA, blur: float = 0.6
-) -> NDArray[np.uint8]:
+    rgb: Float32Array, rng: np.random.Generator, sigma: float = RGB_SIGMA, blur: float = 0.6
+) -> Image:
     """[H, W, 3] uint8 of an exposed float image (1 = white): the optics' blur (sigma px), noise
     (sigma grey levels).
     """
@@ -34,7 +34,7 @@ def photograph(
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def smear(rgb: Floats, length: float, angle: float) -> Floats:
+def smear(rgb: Float32Array, length: float, angle: float) -> Float32Array:
     """Motion blur: the mean along a line of `length` px at `angle` rad."""
     size = int(np.ceil(length)) | 1
     if size < 3:
@@ -49,13 +49,13 @@ def smear(rgb: Floats, length: float, angle: float) -> Floats:
     )
 
 
-def depth_edges(depth: Floats) -> NDArray[np.bool_]:
+def depth_edges(depth: Float32Array) -> Mask:
     """[H, W] pixels whose 3 x 3 neighbourhood spans more than 4 % of its depth: both sides of every
     outline.
     """
     kernel = np.ones((3, 3), dtype=np.uint8)
     span = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
-    edges: NDArray[np.bool_] = span > 0.04 * depth
+    edges: Mask = span > 0.04 * depth
     return edges
 
 

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder
 from cohdc_train.synth.actors import fastest
-from cohdc_train.synth.camera_motion import MOTIONS, CameraMotion, Doubles
+from cohdc_train.synth.camera_motion import MOTIONS, CameraMotion
+from cohdc_train.synth.option_checks import check_size_and_seed
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Camera
 from cohdc_train.synth.scenario import RATE, TRUTH_PER_FRAME, Scene, Setting, draw_scene
 from cohdc_train.synth.sensor import DEPTH_SCALE, exposure, measure_depth, photograph
+from cohdc_train.types import FloatArray
 
 FIRST_STAMP = 1305031102.175304  # s
 MOVES = 0.05  # m/s: an actor none of whose points is faster stands still
@@ -74,19 +76,14 @@ def sequence(
     print(f"{out}: {frames} frames; {covered}, {moving.mean():.1%} moves")
 
 
-def _spread(shares: Doubles) -> dict[str, float]:
+def _spread(shares: FloatArray) -> dict[str, float]:
     return {"mean": float(shares.mean()), "min": float(shares.min()), "max": float(shares.max())}
 
 
 def _check(frames: int, size: tuple[int, int], seed: int, motion: str, people: int) -> None:
     if frames < 2:
         raise DataError(f"frames: {frames} is too few; a sequence has at least 2")
-    if min(size) < 48:
-        raise DataError(
-            f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48"
-        )
-    if seed < 0:
-        raise DataError(f"seed: {seed} is negative")
+    check_size_and_seed(size, seed)
     if motion not in MOTIONS:
         raise DataError(f"motion: {motion!r} is none of {', '.join(MOTIONS)}")
     if not 0 <= people <= MOST_PEOPLE:
@@ -98,7 +95,7 @@ def stamps(frames: int) -> list[str]:
     return [f"{FIRST_STAMP + k / RATE:.6f}" for k in range(frames)]
 
 
-def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[Doubles, Doubles]:
+def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[FloatArray, FloatArray]:
     """Write rgb/, depth/, masks/ and movers/; returns the shares of person pixels and of moving
     ones per frame.
     """
@@ -138,7 +135,7 @@ def _write_lists(folder: Path, frames: int, title: str) -> None:
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
 
 
-def _write_truth(path: Path, truth: Doubles, title: str) -> None:
+def _write_truth(path: Path, truth: FloatArray, title: str) -> None:
     """T_wc as `stamp tx ty tz qx qy qz qw`, m, at 90 Hz."""
     from scipy.spatial.transform import Rotation
 

@@ -2,14 +2,14 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Texture = NDArray[np.uint8]  # [h, w, 3] RGB, h and w powers of two
-Floats = NDArray[np.float32]
+from cohdc_train.types import Float32Array, Image
+
+Texture = Image  # [h, w, 3] RGB, h and w powers of two
 SATURATION = 0.35  # rooms are painted in calmer colours than people are dressed in
 
 
-def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) -> Floats:
+def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) -> Float32Array:
     """[height, width] smooth noise of several octaves, mean about 0, standard deviation about 1."""
     total = np.zeros((height, width), dtype=np.float32)
     cells, weight = coarsest, 1.0
@@ -20,7 +20,7 @@ def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) 
     return total / max(float(total.std()), 1e-6)
 
 
-def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Floats:
+def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Float32Array:
     """[3] an RGB colour with components in low..high, from grey to strongly tinted."""
     base = rng.uniform(low, high)
     mixed = base + rng.normal(0, 1, 3) * rng.uniform(4, 60)
@@ -28,7 +28,7 @@ def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Floa
 
 
 def finish(
-    image: Floats, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0
+    image: Float32Array, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0
 ) -> Texture:
     """Dirt and grain over a drawn surface in muted colours: float [h, w, 3] in 0..255 -> uint8."""
     height, width = image.shape[:2]
@@ -39,7 +39,7 @@ def finish(
     return np.clip(image + dirt[..., None], 0, 255).astype(np.uint8)
 
 
-def flat(height: int, width: int, rgb: Floats) -> Floats:
+def flat(height: int, width: int, rgb: Float32Array) -> Float32Array:
     """[height, width, 3] float32 of one colour."""
     return np.tile(rgb.astype(np.float32), (height, width, 1))
 
@@ -236,7 +236,7 @@ def carton(rng: np.random.Generator, height: int, width: int) -> Texture:
     return finish(image, rng, 7, 9)
 
 
-def letters(image: Floats, rng: np.random.Generator, lines: int) -> None:
+def letters(image: Float32Array, rng: np.random.Generator, lines: int) -> None:
     """Write lines of random letters over a float [h, w, 3] image, in place."""
     height, width = image.shape[:2]
     alphabet = list("ABCDEFGHKLMNPRSTUVXYZ0123456789abdefghknprt#%&")
@@ -246,7 +246,9 @@ def letters(image: Floats, rng: np.random.Generator, lines: int) -> None:
         write(image, text, place, float(rng.uniform(0.25, 1.1) * width / 256), colour(rng, 5, 250))
 
 
-def write(image: Floats, text: str, place: tuple[int, int], scale: float, ink: Floats) -> None:
+def write(
+    image: Float32Array, text: str, place: tuple[int, int], scale: float, ink: Float32Array
+) -> None:
     """Lay one line of text over a float [h, w, 3] image, in place (OpenCV writes on uint8 only)."""
     top, bottom = max(place[1] - int(40 * scale) - 2, 0), place[1] + int(16 * scale) + 2
     rows = image[top:bottom]

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cohdc_train.synth.camera_motion import Doubles, sway
+from cohdc_train.synth.camera_motion import sway
+from cohdc_train.types import FloatArray, IntArray
 
 _SMOOTH = 0.35  # s over which a pace changes
 _TURN = 0.8  # s that a turn on the spot takes
@@ -22,10 +22,10 @@ class Walk:
     position: [n, 2] m; heading: [n] rad; travelled: [n] m; pace: [n] 0 = stands, 1 = walks.
     """
 
-    position: Doubles
-    heading: Doubles
-    travelled: Doubles
-    pace: Doubles
+    position: FloatArray
+    heading: FloatArray
+    travelled: FloatArray
+    pace: FloatArray
 
     def moved(self, x: float, y: float) -> "Walk":
         """The same way, `x` and `y` m further."""
@@ -33,7 +33,7 @@ class Walk:
 
 
 def crowd(
-    rng: np.random.Generator, times: Doubles, distances: Doubles, reach: float
+    rng: np.random.Generator, times: FloatArray, distances: FloatArray, reach: float
 ) -> tuple[Walk, ...]:
     """People who cross the view side by side, again and again, slowly, mostly in one direction,
     stopping midway.
@@ -51,7 +51,7 @@ def crowd(
     )
     half = float(np.max(0.62 * distances + np.abs(sides))) + reach
     usual = float(rng.choice([-1.0, 1.0]))
-    pieces: list[Doubles] = []
+    pieces: list[FloatArray] = []
     while sum(len(piece) for piece in pieces) < len(times):
         direction = usual if rng.random() < 5 / 6 else -usual
         path = direction * _crossing(rng, step, half)
@@ -66,10 +66,10 @@ def crowd(
 
 def _walk_in_crowd(
     rng: np.random.Generator,
-    times: Doubles,
-    line: Doubles,
+    times: FloatArray,
+    line: FloatArray,
     place: tuple[float, float],
-    jumps: NDArray[np.int64],
+    jumps: IntArray,
 ) -> Walk:
     """One of a crowd: `line` [n] m is the way of its middle, `place` (distance, side) m this
     person's place in it.
@@ -80,7 +80,7 @@ def _walk_in_crowd(
 
 
 def walk_along(
-    times: Doubles, position: Doubles, start: float, jumps: NDArray[np.int64] | None = None
+    times: FloatArray, position: FloatArray, start: float, jumps: IntArray | None = None
 ) -> Walk:
     """A person who walks where `position` [n, 2] m leads, looking ahead.
 
@@ -97,7 +97,7 @@ def walk_along(
     return Walk(position, heading, start + np.cumsum(speed), pace)
 
 
-def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
+def _crossing(rng: np.random.Generator, step: float, half: float) -> FloatArray:
     """[k] m from -half to half at even time steps, with a stop near the middle."""
     pace = rng.uniform(0.5, 0.75)
     stop = rng.uniform(-0.25, 0.25)
@@ -110,17 +110,17 @@ def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
     return _smooth(x, _SMOOTH / step)
 
 
-def _smooth(line: Doubles, frames: float) -> Doubles:
+def _smooth(line: FloatArray, frames: float) -> FloatArray:
     """Moving mean of [n] over `frames`."""
     window = max(round(frames), 1) | 1
-    smooth: Doubles = np.convolve(
+    smooth: FloatArray = np.convolve(
         np.pad(line, window // 2, mode="edge"), np.ones(window) / window, mode="valid"
     )
     return smooth
 
 
 def led_round(
-    walks: tuple[Walk, ...], times: Doubles, eyes: Doubles, headings: Doubles
+    walks: tuple[Walk, ...], times: FloatArray, eyes: FloatArray, headings: FloatArray
 ) -> tuple[Walk, ...]:
     """The walks of a crowd bent into arcs about `eyes` [n, 2] m, and turned with a camera that
     looks along `headings`.
@@ -139,8 +139,12 @@ def led_round(
 
 
 def errands(
-    rng: np.random.Generator, times: Doubles, reach: float, pause: tuple[float, float], pace: float
-) -> Doubles:
+    rng: np.random.Generator,
+    times: FloatArray,
+    reach: float,
+    pause: tuple[float, float],
+    pace: float,
+) -> FloatArray:
     """[n] m: a thing that stands still, goes to another place within +-reach, stands again, and so
     on.
 
@@ -167,7 +171,7 @@ def _stops(
 
 
 def rolled(
-    rng: np.random.Generator, times: Doubles, line: Doubles, behind: float
+    rng: np.random.Generator, times: FloatArray, line: FloatArray, behind: float
 ) -> tuple[Walk, Walk]:
     """The ways of a cart that goes forwards and backwards along `line` [n] m, aslant, and of who
     pushes it.
@@ -187,7 +191,9 @@ def rolled(
     return cart, replace(cart, position=position + behind * ahead)
 
 
-def stop_and_go(rng: np.random.Generator, times: Doubles, distances: Doubles) -> tuple[Walk, ...]:
+def stop_and_go(
+    rng: np.random.Generator, times: FloatArray, distances: FloatArray
+) -> tuple[Walk, ...]:
     """People who stand in the view for 1.5-2.5 s without a movement, walk on, stand again, each at
     a time of their own.
 
@@ -203,7 +209,7 @@ def stop_and_go(rng: np.random.Generator, times: Doubles, distances: Doubles) ->
     return tuple(walks)
 
 
-def _turning(times: Doubles, line: Doubles) -> Doubles:
+def _turning(times: FloatArray, line: FloatArray) -> FloatArray:
     """[n] rad: 0 while `line` [n] m rises, pi while it falls; the turn between is over when the way
     begins.
     """
@@ -216,7 +222,7 @@ def _turning(times: Doubles, line: Doubles) -> Doubles:
     return _smooth(np.where(ways[moving[np.maximum(latest, 0)]] > 0, 0.0, np.pi), 2 * lead)
 
 
-def approach(times: Doubles, poses: Doubles) -> Walk:
+def approach(times: FloatArray, poses: FloatArray) -> Walk:
     """A person who comes up to the camera, stands before it for 3 tenths of the time, wherever it
     moves, and goes.
 

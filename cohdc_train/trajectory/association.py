@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
-from cohdc_train.trajectory.trajectory import FloatArray, Trajectory
+from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import FloatArray
 
 
 def associate(a: FloatArray, b: FloatArray, max_difference: float = 0.02) -> NDArray[np.int64]:

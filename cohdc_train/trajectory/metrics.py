@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.trajectory.association import nearest
-from cohdc_train.trajectory.trajectory import FloatArray, Trajectory
+from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import FloatArray
 
 Scores = dict[str, dict[str, float]]
 MAX_PAIRS = 1_000_000  # up to 1000 poses every pair is used; above, a seeded sample of this size

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import write_text
-
-FloatArray = NDArray[np.float64]
+from cohdc_train.types import FloatArray
 
 _LOG = logging.getLogger(__name__)
 

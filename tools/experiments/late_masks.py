@@ -25,7 +25,7 @@ from cohdc_train.segmenter import Segmenter
 from cohdc_train.slam.config import Culling, Method
 from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import grow
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded, rgbd_layout
@@ -35,6 +35,7 @@ from cohdc_train.slam.runtime.threads import one_thread
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.types import Mask
 
 
 class LateMasks:

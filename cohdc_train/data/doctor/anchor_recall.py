@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from cohdc_train.types import FloatArray
 
 STRIDES = (4, 8, 16, 32, 64)  # px, of the pyramid's levels
 RATIOS = (0.5, 1.0, 2.0)  # height / width
@@ -26,9 +27,7 @@ class AnchorRecall(NamedTuple):
     at_70: float
 
 
-def best_overlap(
-    boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]
-) -> NDArray[np.float64]:
+def best_overlap(boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, int]) -> FloatArray:
     """The largest IoU of each box with an anchor of torchvision's grid: one scale per level from
     stride 4, 3 ratios.
 
@@ -49,9 +48,7 @@ def best_overlap(
     return best
 
 
-def recall(
-    boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]
-) -> list[AnchorRecall]:
+def recall(boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, int]) -> list[AnchorRecall]:
     """Anchor-to-object recall by size. boxes, canvas: as `best_overlap` takes them; sizes without
     objects are left out.
 
@@ -71,10 +68,10 @@ def recall(
     return rows
 
 
-def _iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _iou(a: FloatArray, b: FloatArray) -> FloatArray:
     """IoU of boxes [N, 4] xyxy, pair by pair."""
     inside = (np.minimum(a[:, 2:], b[:, 2:]) - np.maximum(a[:, :2], b[:, :2])).clip(0).prod(axis=1)
     areas = [(box[:, 2:] - box[:, :2]).prod(axis=1) for box in (a, b)]
     union = areas[0] + areas[1] - inside
-    iou: NDArray[np.float64] = np.divide(inside, union, out=np.zeros_like(inside), where=union > 0)
+    iou: FloatArray = np.divide(inside, union, out=np.zeros_like(inside), where=union > 0)
     return iou

@@ -8,7 +8,7 @@ import numpy as np
 from pycocotools import mask as rle
 from shapely import Polygon, box, clip_by_rect, get_parts
 
-from cohdc_train.data.annotations import fills, is_crowd, is_numbers
+from cohdc_train.data.annotations import fills, is_crowd, is_numbers, rle_as_text
 
 _TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
 _DISAGREE, _AGREE = (
@@ -108,7 +108,7 @@ def _mend_segmentation(given: Any, height: int, width: int) -> tuple[list[str], 
         polygons += [list(map(float, part))] if inside is None else inside
     if crossing and polygons:
         findings.append("contour-crossing")
-        return findings, _text(rle.merge(rle.frPyObjects(polygons, height, width)))
+        return findings, rle_as_text(rle.merge(rle.frPyObjects(polygons, height, width)))
     if not polygons and "contour-outside" in findings:
         findings.append("contour-empty")
     return findings, polygons or None
@@ -161,7 +161,9 @@ def _mend_rle(
         return ["rle-size"], None
     if not fills(counts, height * width):
         return ["rle-counts"], None
-    return [], _text(rle.frPyObjects(given, height, width) if isinstance(counts, list) else given)
+    return [], rle_as_text(
+        rle.frPyObjects(given, height, width) if isinstance(counts, list) else given
+    )
 
 
 def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str], Box]:
@@ -203,12 +205,3 @@ def _near(a: Box, b: Box) -> bool:
     """
     edges = [(v[0], v[1], v[0] + v[2], v[1] + v[3]) for v in (a, b)]
     return all(abs(one - other) <= _TOLERANCE for one, other in zip(*edges, strict=True))
-
-
-def _text(encoded: dict[str, Any]) -> dict[str, Any]:
-    """A compressed RLE whose counts are text, as JSON wants them."""
-    counts = encoded["counts"]
-    return {
-        "size": list(encoded["size"]),
-        "counts": counts.decode() if isinstance(counts, bytes) else counts,
-    }

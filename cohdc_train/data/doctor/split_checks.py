@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as rle
 
 from cohdc_train.data.annotations import is_crowd
@@ -15,11 +14,11 @@ from cohdc_train.data.doctor.annotation_checks import examine, fits
 from cohdc_train.data.doctor.issues import Findings
 from cohdc_train.data.image_files import ImageFile, fingerprint, look
 from cohdc_train.data.layout import SplitPaths, read_json
+from cohdc_train.types import Float32Array, Row
 
 _SAME_OBJECT = 0.95  # mask IoU
 _HUGE = 24_000_000  # px
 _CROWDED = 100  # objects
-Row = dict[str, Any]
 
 
 @dataclass
@@ -40,7 +39,7 @@ class Inspection:
     findings: Findings = field(default_factory=Findings)
     content: dict[str, Any] = field(default_factory=dict)
     removed: list[Row] = field(default_factory=list)
-    prints: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    prints: dict[str, Float32Array] = field(default_factory=dict)
 
     def remove(self, why: str, row: Any) -> None:
         """Keep a row that is left out of the mended content beside its reason."""
@@ -169,7 +168,7 @@ def _image(split: Inspection, row: Row, annotations: Sequence[Row]) -> Row | Non
     return sized
 
 
-def _fingerprint(path: Path) -> NDArray[np.float32]:
+def _fingerprint(path: Path) -> Float32Array:
     try:
         return fingerprint(path)
     except OSError:  # a format that only OpenCV reads

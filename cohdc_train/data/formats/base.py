@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as rle
 
 from cohdc_train.data.image_files import PROBLEMS, look
 from cohdc_train.errors import DataError
+from cohdc_train.images import IMAGE_SUFFIXES
+from cohdc_train.types import Mask
 
-IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
 _SAGITTA = 0.05  # px by which an arc may leave the chord that stands for it
 
 
@@ -177,7 +177,7 @@ def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> l
     return flat
 
 
-def encode(mask: NDArray[np.bool_]) -> dict[str, Any]:
+def encode(mask: Mask) -> dict[str, Any]:
     """The compressed RLE of a mask [H, W]."""
     return dict(rle.encode(np.asfortranarray(mask, dtype=np.uint8)))
 

@@ -23,6 +23,7 @@ from cohdc_train.data.formats.base import (
 from cohdc_train.data.formats.splits import TEST, settle_splits, split_named, split_of
 from cohdc_train.data.layout import load_json
 from cohdc_train.errors import DataError
+from cohdc_train.types import Row
 
 _NEEDS = {
     "polygon": ("all_points_x", "all_points_y"),
@@ -30,7 +31,6 @@ _NEEDS = {
     "circle": ("cx", "cy", "r"),
     "ellipse": ("cx", "cy", "rx", "ry"),
 }
-Row = dict[str, Any]
 
 
 def read_via(root: Path, attribute: str | None = None, names: Path | None = None) -> Source:

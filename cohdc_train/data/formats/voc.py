@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from cohdc_train.data.formats.base import (
-    IMAGE_SUFFIXES,
     Source,
     SourceImage,
     SourceObject,
@@ -20,6 +18,8 @@ from cohdc_train.data.formats.base import (
 )
 from cohdc_train.data.formats.splits import TEST, TEST_LEFT_OUT, split_named
 from cohdc_train.errors import DataError
+from cohdc_train.images import IMAGE_SUFFIXES
+from cohdc_train.types import Int32Array
 
 # fmt: off
 VOC_NAMES = (
@@ -32,7 +32,6 @@ _IGNORED = frozenset(["ignored", "__ignore__"])
 _VOID = 255
 _NUMBERS = ("P", "L", "1")  # modes of PNGs whose pixels are numbers
 _MODES = (*_NUMBERS, "RGB", "RGBA")
-Labels = NDArray[np.int32]
 
 
 class ClassTable(NamedTuple):
@@ -184,7 +183,7 @@ def _read_image(
     return image.holding(found)
 
 
-def _object_labels(path: Path) -> tuple[Labels, int]:
+def _object_labels(path: Path) -> tuple[Int32Array, int]:
     """[H, W] number of the object at each pixel, 0 none; and the number that means void."""
     with _open(path) as picture:
         if picture.mode in _NUMBERS:
@@ -192,7 +191,7 @@ def _object_labels(path: Path) -> tuple[Labels, int]:
         return _colours(picture), _voc_colour(_VOID)
 
 
-def _class_labels(path: Path, table: ClassTable) -> Labels:
+def _class_labels(path: Path, table: ClassTable) -> Int32Array:
     """[H, W] class at each pixel: 1..C, 0 background, 255 void."""
     with _open(path) as picture:
         if picture.mode in _NUMBERS and not (picture.mode == "P" and table.painted):
@@ -211,10 +210,10 @@ def _class_labels(path: Path, table: ClassTable) -> Labels:
     return known[place.reshape(colours.shape)]
 
 
-def _colours(picture: Image.Image) -> Labels:
+def _colours(picture: Image.Image) -> Int32Array:
     """[H, W] 0xRRGGBB."""
     rgb = np.asarray(picture.convert("RGB")).astype(np.int32)
-    packed: Labels = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
+    packed: Int32Array = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
     return packed
 
 

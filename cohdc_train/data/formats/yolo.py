@@ -10,7 +10,6 @@ from typing import Any
 import yaml
 
 from cohdc_train.data.formats.base import (
-    IMAGE_SUFFIXES,
     Source,
     SourceImage,
     SourceObject,
@@ -20,10 +19,11 @@ from cohdc_train.data.formats.base import (
     rectangle,
 )
 from cohdc_train.errors import DataError
+from cohdc_train.images import IMAGE_SUFFIXES
+from cohdc_train.types import Row
 
 _SPLITS = ("train", "val")
 _FARTHEST = 2.0  # image sides; farther out, a coordinate is no normalised one
-Row = dict[str, Any]
 
 
 def read_yolo(root: Path) -> Source:
