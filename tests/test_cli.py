@@ -133,7 +133,7 @@ def test_users_error_is_one_line_and_ends_with_one(
     assert captured.out == ""
     assert (
         captured.err
-        == f"cohdc evaluate: {bad}:1: 3 numbers where stamp tx ty tz qx qy qz qw are 8\n"
+        == f"cohdc evaluate: {bad}:1: 3 numbers; timestamp tx ty tz qx qy qz qw are 8\n"
     )
 
 

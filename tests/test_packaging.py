@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tool_loader import load_tool
 
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCKERFILES = sorted((ROOT / "docker").glob("*.Dockerfile"))
@@ -50,7 +50,7 @@ def draw_sequence(folder: Path, frames: int = 12) -> None:
         "depth_scale": 5000,
     }
     (folder / "camera.yaml").write_text(json.dumps(camera))  # JSON is YAML
-    write_tum(folder / "groundtruth.txt", Trajectory(np.arange(frames) / 30, poses))
+    Trajectory(np.arange(frames) / 30, poses).save_tum(folder / "groundtruth.txt")
 
 
 class Clean:
@@ -102,7 +102,7 @@ def test_wheel_runs_outside_the_repository_without_torch(clean: Clean) -> None:
     where, torch = clean.run("python", "-c", code).split()
     assert Path(where).is_relative_to(clean.folder)
     assert torch == "None"
-    assert "no fault found" in clean.run("cohdc", "env")
+    assert "no problem found" in clean.run("cohdc", "env")
 
 
 @pytest.mark.slow

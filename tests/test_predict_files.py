@@ -16,22 +16,23 @@ from test_predict import Fake, picture
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import files_below
-from cohdc_train.prediction.image_sources import Picture, read_pictures
-from cohdc_train.prediction.predict import predict, predict_pictures
+from cohdc_train.prediction.image_sources import SourceImage, read_images
+from cohdc_train.prediction.options import PredictOptions
+from cohdc_train.prediction.predict import predict, predict_images
 
 FLOOR = 0.93
 
 
-def photographs(folder: Path) -> list[Picture]:
+def photographs(folder: Path) -> list[SourceImage]:
     """Four of them, on disk."""
     folder.mkdir()
     for name in "abcd":
         cv2.imwrite(str(folder / f"{name}.png"), picture().rgb)
-    return list(read_pictures(folder))
+    return list(read_images(folder))
 
 
-def written(folder: Path, pictures: Iterable[Picture], **options: Any) -> dict[str, Any]:
-    return predict_pictures(pictures, Fake(), folder, iou_floor=FLOOR, **options)
+def written(folder: Path, pictures: Iterable[SourceImage], **options: Any) -> dict[str, Any]:
+    return predict_images(pictures, Fake(), folder, PredictOptions(iou_floor=FLOOR, **options))
 
 
 def holds_what_was_found(found: list[tuple[str, Any]]) -> None:
@@ -102,7 +103,7 @@ def test_corrected_labelme_files_are_not_written_over(tmp_path: Path) -> None:
     pictures = photographs(tmp_path / "photos")
     written(tmp_path / "out", pictures, format="labelme")
     (tmp_path / "out" / "b.json").write_text("corrected")
-    with pytest.raises(DataError, match=r"a\.json: is there already, perhaps corrected by hand"):
+    with pytest.raises(DataError, match=r"a\.json: exists, perhaps corrected by hand"):
         written(tmp_path / "out", pictures, format="labelme")
     assert (tmp_path / "out" / "b.json").read_text() == "corrected"
 
@@ -111,7 +112,7 @@ def test_what_was_found_before_a_broken_image_is_kept(tmp_path: Path) -> None:
     photographs(tmp_path / "photos")
     (tmp_path / "photos" / "z.png").write_bytes(b"broken")
     with pytest.raises(DataError, match=r"z\.png: cannot be decoded"):
-        written(tmp_path / "out", read_pictures(tmp_path / "photos"))
+        written(tmp_path / "out", read_images(tmp_path / "photos"))
     assert len(json.loads((tmp_path / "out" / "predictions.json").read_text())["images"]) == 4
 
 
@@ -119,7 +120,7 @@ def test_yolo_refuses_two_pictures_of_one_stem(tmp_path: Path) -> None:
     photographs(tmp_path / "photos")
     cv2.imwrite(str(tmp_path / "photos" / "a.jpg"), picture().rgb)
     with pytest.raises(DataError, match=r"a\.jpg: another image has this stem"):
-        written(tmp_path / "out", read_pictures(tmp_path / "photos"), format="yolo")
+        written(tmp_path / "out", read_images(tmp_path / "photos"), format="yolo")
 
 
 @pytest.mark.parametrize("option", ["iou_floor", "score", "check_below", "quality"])
@@ -156,9 +157,8 @@ def test_fewer_vertices_make_smaller_files(tmp_path: Path, format: Any) -> None:
     sizes = {}
     for floor in (0.9, 1.0):
         folder = tmp_path / str(floor)
-        predict_pictures(
-            [picture()], Fake(), folder, iou_floor=floor, format=format, contour="bas_dp"
-        )
+        options = PredictOptions(iou_floor=floor, format=format, contour="bas_dp")
+        predict_images([picture()], Fake(), folder, options)
         files = [
             file
             for file in folder.rglob("*")

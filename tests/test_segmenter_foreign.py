@@ -11,7 +11,7 @@ from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
 from cohdc_train.cli import main
 from cohdc_train.errors import ContractError
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.segmenter.adapters import MOST
+from cohdc_train.segmenter.adapters import MAX_DETECTIONS
 
 CANVAS = (64, 96)
 CLASSES = ("person", "dog", "car")
@@ -94,7 +94,7 @@ def test_yolo_boxes_masks_labels_and_suppression(tmp_path):
         candidate([30, 20, 40, 24], 1, 0.4, 2),  # a dog where the car is
         candidate([60, 40, 10, 10], 1, 0.04, 0),  # below the threshold
     )
-    file = Segmenter(yolo(tmp_path / "y.onnx", table), threads=1)
+    file = Segmenter(yolo(tmp_path / "y.onnx", table), num_threads=1)
     assert file.class_names == CLASSES
     assert file.canvas == CANVAS
     found = file(red(128, 192))  # twice the canvas: no border
@@ -151,7 +151,7 @@ def test_yolo_finds_at_most_as_many_as_a_contract_file_and_may_find_none(tmp_pat
         )
     )
     found = Segmenter(yolo(tmp_path / "y.onnx", many))(red(64, 96))
-    assert len(found) == MOST
+    assert len(found) == MAX_DETECTIONS
     assert np.all(np.diff(found.scores) <= 0)
     nothing = Segmenter(yolo(tmp_path / "n.onnx", columns()))(red(64, 96))
     assert len(nothing) == 0
@@ -213,7 +213,7 @@ def test_an_image_to_image_graph_is_no_segmenter(tmp_path, shape):
         tmp_path / "i.onnx",
     )
     with pytest.raises(
-        ContractError, match="neither cohdc export nor a known foreign exporter wrote it"
+        ContractError, match="neither cohdc export nor another known exporter wrote it"
     ):
         Segmenter(tmp_path / "i.onnx")
 
@@ -253,7 +253,7 @@ def test_torchvisions_own_export_gives_what_torchvision_finds(torchvisions, tmp_
     (tmp_path / "torchvision.onnx.txt").write_text("person\ncar\n")
     with torch.inference_mode():
         expected = torchvisions([x])[0]
-    file = Segmenter(path, threads=1)
+    file = Segmenter(path, num_threads=1)
     assert file.canvas == (96, 128)
     found = file(image)
     scale = size[0] / 96

@@ -35,7 +35,7 @@ def test_a_name_means_the_shipped_file_unless_there_is_a_file_of_that_name(
 
 @pytest.mark.parametrize(("name", "canvas"), CANVASES.items())
 def test_it_keeps_the_contract_and_is_small(name: str, canvas: tuple[int, int]) -> None:
-    segmenter = Segmenter(Path(name), threads=1)
+    segmenter = Segmenter(Path(name), num_threads=1)
     assert segmenter.class_names == ("person",)
     assert segmenter.canvas == canvas
     assert segmenter.cut_by_quality
@@ -67,7 +67,7 @@ def test_it_finds_the_people_of_walking_xyz(name: str) -> None:
     """Two in each photograph; the sixteenth is cut by the picture's edge."""
     if not PHOTOS.is_dir():
         pytest.skip("needs TUM's photographs beside the repository")
-    segmenter = Segmenter(Path(name), threads=1)
+    segmenter = Segmenter(Path(name), num_threads=1)
     counts = []
     for file in sorted(PHOTOS.iterdir()):
         if (image := cv2.imread(str(file))) is not None:

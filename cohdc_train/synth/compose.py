@@ -188,12 +188,12 @@ def read_recording(sequence: Path, camera_file: Path | None, num_frames: int | N
     from cohdc_train.slam.geometry.calibration import choose_camera
     from cohdc_train.slam.io.tum import read_pairs
     from cohdc_train.trajectory.association import associate
-    from cohdc_train.trajectory.trajectory import read_tum
+    from cohdc_train.trajectory.trajectory import Trajectory
 
     camera, _ = choose_camera(sequence, camera_file)
     pairs = read_pairs(sequence / "rgb.txt", sequence / "depth.txt", 0.02)[0][:num_frames]
-    truth = read_tum(sequence / "groundtruth.txt")
-    matches = associate(np.array([color.t for color, _ in pairs]), truth.stamps)
+    truth = Trajectory.load_tum(sequence / "groundtruth.txt")
+    matches = associate(np.array([color.t for color, _ in pairs]), truth.timestamps)
     if not len(matches):
         raise DataError(f"{sequence}: no frame within 0.02 s of a pose of groundtruth.txt")
     pairs = [pairs[i] for i in matches[:, 0]]

@@ -26,7 +26,7 @@ from cohdc_train.contour import Polygon, rasterize, simplify, trace, vertices
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes, write_json, write_text
 from cohdc_train.models.cqe_targets import band_of, boundary_iou
-from cohdc_train.prediction.image_sources import read_pictures
+from cohdc_train.prediction.image_sources import read_images
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.synth.coco import coco
 
@@ -89,9 +89,9 @@ def sources(arguments: argparse.Namespace) -> Iterator[tuple[str, list[np.ndarra
         name, _, root = entry.partition("=")
         yield name, annotated(Path(root), arguments.count, rng)
     if arguments.model is not None:
-        network = Segmenter(arguments.model, threads=1)
+        network = Segmenter(arguments.model, num_threads=1)
         masks: list[np.ndarray] = []
-        for picture in read_pictures(arguments.photos):
+        for picture in read_images(arguments.photos):
             found = network(picture.rgb)
             masks += [
                 mask

@@ -21,7 +21,7 @@ import yaml
 from cohdc_train.bench.speed import frame_rates, make_runners
 from cohdc_train.exporter.graph import count_flops, write_graph
 from cohdc_train.exporter.quantization import quantize
-from cohdc_train.exporter.sample_images import drawn_images
+from cohdc_train.exporter.sample_images import draw_samples
 from cohdc_train.files import write_json, write_text
 from cohdc_train.models import MaskRCNN, NetworkConfig
 from cohdc_train.presets import config_path
@@ -94,7 +94,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(arguments.threads)
-    pictures, runners, costs = drawn_images(arguments.pictures), {}, {}
+    pictures, runners, costs = draw_samples(arguments.pictures), {}, {}
     for name in arguments.designs:
         torch.manual_seed(arguments.seed)
         config = NetworkConfig(**{"canvas": tuple(arguments.canvas), **DESIGNS[name]})

@@ -30,7 +30,7 @@ from cohdc_train.slam.io.sources import Recorded
 from cohdc_train.slam.run import run_source
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.association import associate
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 RATE = 30  # frames per second
 
@@ -76,9 +76,8 @@ class ForthAndBack:
         self.groundtruth: Path | None = None
         if recorded.groundtruth is not None:
             self.groundtruth = out / "groundtruth.txt"
-            write_tum(
-                self.groundtruth, self._truth(read_tum(recorded.groundtruth), np.array(stamps))
-            )
+            truth = Trajectory.load_tum(recorded.groundtruth)
+            self._truth(truth, np.array(stamps)).save_tum(self.groundtruth)
 
     def __len__(self) -> int:
         return len(self._order)
@@ -97,7 +96,7 @@ class ForthAndBack:
 
     def _truth(self, truth: Trajectory, stamps: np.ndarray) -> Trajectory:
         """The pose nearest in time to every image, at the times they are played."""
-        row = dict(associate(stamps, truth.stamps, 0.02).tolist())
+        row = dict(associate(stamps, truth.timestamps, 0.02).tolist())
         known = [
             (number / RATE, row[place]) for number, place in enumerate(self._order) if place in row
         ]
