@@ -31,12 +31,12 @@ def roi_window(
     first pixel.
 
     roi_mask: [M, M] probability; box: [4] xyxy, px; size: (height, width) of the image, px.
-    A pixel's centre is mapped into the RoI grid and sampled bilinearly; pixels whose centre lies
+    A pixel's center is mapped into the RoI grid and sampled bilinearly; pixels whose center lies
     outside the box are no part of the mask.
     """
     height, width = size
     x0, y0, x1, y1 = (float(v) for v in box)
-    # pixels whose centre lies inside the box
+    # pixels whose center lies inside the box
     left, right = max(int(np.ceil(x0 - 0.5)), 0), min(int(np.ceil(x1 - 0.5)), width)
     top, bottom = max(int(np.ceil(y0 - 0.5)), 0), min(int(np.ceil(y1 - 0.5)), height)
     if right <= left or bottom <= top:

@@ -11,7 +11,7 @@ and M (mask side) are fixed in the file. Rows at or after `count` are padding an
 | labels | int64 [B, N] | index into the class names |
 | scores | float32 [B, N] | class score, falling |
 | quality | float32 [B, N] | CQE's estimate of the mask's IoU with the object, 0..1 |
-| masks | float32 [B, N, M, M] | of the box, cut at `KEY_THRESHOLDS`; cell (i, j) is centred (i +
+| masks | float32 [B, N, M, M] | of the box, cut at `KEY_THRESHOLDS`; cell (i, j) is centered (i +
 .5) / M of its side |
 | count | int64 [B] | how many leading rows are detections |
 """

@@ -1,4 +1,4 @@
-"""Pasting RoI masks: known answers and exact behaviour under translation."""
+"""Pasting RoI masks: known answers and exact behavior under translation."""
 
 import numpy as np
 from hypothesis import given
@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from cohdc_train.masks import paste_roi_mask
 
 
-def test_a_full_mask_fills_exactly_the_pixels_whose_centre_is_in_the_box():
+def test_a_full_mask_fills_exactly_the_pixels_whose_center_is_in_the_box():
     mask = paste_roi_mask(
         np.ones((28, 28), np.float32), np.array([2.5, 1.0, 6.4, 3.6], np.float32), (5, 9)
     )
     expected = np.zeros((5, 9), bool)
-    expected[1:4, 2:6] = True  # centres 1.5, 2.5, 3.5 and 2.5 .. 5.5
+    expected[1:4, 2:6] = True  # centers 1.5, 2.5, 3.5 and 2.5 .. 5.5
     np.testing.assert_array_equal(mask, expected)
 
 

@@ -10,7 +10,7 @@ from pycocotools import mask as rle
 
 from cohdc_train.bench.speed import LIKELY
 from cohdc_train.bench.training import Trained, train
-from cohdc_train.contour import simplify, trace, vertices
+from cohdc_train.contour import count_vertices, simplify, trace
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.exporter.export import export
@@ -161,5 +161,7 @@ def mean_vertices(results: Results) -> float:
         for row in results.rows
         if row["score"] >= LIKELY
     ]
-    counts = [vertices(simplify(trace(mask), _IOU_FLOOR, "bas_dp")) for mask in masks if mask.any()]
+    counts = [
+        count_vertices(simplify(trace(mask), _IOU_FLOOR, "bas_dp")) for mask in masks if mask.any()
+    ]
     return float(np.mean(counts)) if counts else float("nan")

@@ -18,7 +18,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.images import read_rgb, size_of
 from cohdc_train.types import Image
 
-_FAR = 1e5  # px from which a coordinate is a mistake; pycocotools draws such polygons point by point until memory ends
+_MAX_COORDINATE = 1e5  # px from which a coordinate is a mistake; pycocotools draws such polygons point by point until memory ends
 _CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
 
 
@@ -97,14 +97,14 @@ def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
                 list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0
             ]
             return [
-                part for part in parts if all(abs(value) <= _FAR for value in part)
+                part for part in parts if all(abs(value) <= _MAX_COORDINATE for value in part)
             ]  # neither NaN nor infinite
         if list(given["size"]) != [image.height, image.width]:
             size = f"{image.height}x{image.width}"
             raise DataError(
                 f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}"
             )
-        if not fills(given["counts"], image.height * image.width):
+        if not fills_image(given["counts"], image.height * image.width):
             raise ValueError("RLE counts")
         if isinstance(given["counts"], list):
             given = rle.frPyObjects(given, image.height, image.width)
@@ -120,7 +120,7 @@ def rle_as_text(encoded: dict[str, Any]) -> dict[str, Any]:
     return {"size": list(encoded["size"]), "counts": text}
 
 
-def fills(counts: str | bytes | list[int], pixels: int) -> bool:
+def fills_image(counts: str | bytes | list[int], pixels: int) -> bool:
     """Whether the runs of an RLE, compressed (text) or not, fill so many pixels.
 
     pycocotools decodes a damaged one without a word, into wrong pixels.
@@ -159,23 +159,27 @@ def _decompressed(text: str) -> list[int]:
     return runs
 
 
-def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
+def find_defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
     """Why an annotation cannot be used; empty when it can."""
     box = row.get("bbox")
-    if box is not None and not (is_numbers(box, 4) and _has_extent(_clip(box, image))):
+    if box is not None and not (is_number_list(box, 4) and _has_extent(_clip_box(box, image))):
         return "degenerate box"
     if not segmentation:
         return "" if is_crowd(row) and box is not None else "no contour"
-    return "" if _has_extent(_clip(_extent(segmentation), image)) else "degenerate contour"
+    return (
+        "" if _has_extent(_clip_box(_bounding_box(segmentation), image)) else "degenerate contour"
+    )
 
 
 def build_object(
     row: dict[str, Any], label: int, segmentation: Any, image: CocoImage
 ) -> CocoObject:
     """The object of a sound annotation; a missing box is taken from the contour."""
-    box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
+    box = _clip_box(
+        row["bbox"] if row.get("bbox") is not None else _bounding_box(segmentation), image
+    )
     area, number = row.get("area"), row.get("id")
-    area = float(area) if area and is_numbers([area], 1) else box[2] * box[3]
+    area = float(area) if area and is_number_list([area], 1) else box[2] * box[3]
     return CocoObject(
         number if isinstance(number, int) else 0, label, box, area, segmentation, is_crowd(row)
     )
@@ -186,7 +190,7 @@ def is_crowd(row: dict[str, Any]) -> bool:
     return row.get("iscrowd") in (1, "1", "true")
 
 
-def _extent(segmentation: Any) -> tuple[float, float, float, float]:
+def _bounding_box(segmentation: Any) -> tuple[float, float, float, float]:
     """x, y, width, height of a segmentation."""
     if isinstance(segmentation, dict):
         x, y, width, height = (float(v) for v in rle.toBbox(segmentation))
@@ -196,7 +200,7 @@ def _extent(segmentation: Any) -> tuple[float, float, float, float]:
     return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
-def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, float]:
+def _clip_box(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, float]:
     x0, y0 = max(float(box[0]), 0.0), max(float(box[1]), 0.0)
     x1, y1 = (
         min(float(box[0]) + float(box[2]), image.width),
@@ -205,7 +209,7 @@ def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, 
     return x0, y0, x1 - x0, y1 - y0
 
 
-def is_numbers(values: Any, count: int) -> bool:
+def is_number_list(values: Any, count: int) -> bool:
     """Whether the values are a list of `count` finite numbers."""
     listed = isinstance(values, list | tuple) and len(values) == count
     return listed and all(
@@ -217,7 +221,7 @@ def _has_extent(box: Sequence[float]) -> bool:
     return box[2] > 0 and box[3] > 0
 
 
-def lost_parts(row: dict[str, Any], segmentation: Any) -> int:
+def broken_polygons(row: dict[str, Any], segmentation: Any) -> int:
     """How many polygons of an annotation `read_segmentation` left out beside those it kept."""
     return (
         len(row["segmentation"]) - len(segmentation)
@@ -226,11 +230,11 @@ def lost_parts(row: dict[str, Any], segmentation: Any) -> int:
     )
 
 
-def reaches_out(box: Sequence[float] | None, image: CocoImage) -> bool:
+def exceeds_image(box: Sequence[float] | None, image: CocoImage) -> bool:
     """Whether an annotated box leaves the image by more than the tolerance."""
     if box is None:
         return False
-    inside = _clip(box, image)
+    inside = _clip_box(box, image)
     return max(abs(inside[0] - box[0]), abs(inside[1] - box[1])) > _CLIP_TOLERANCE or (
         max(box[2] - inside[2], box[3] - inside[3]) > _CLIP_TOLERANCE
     )

@@ -15,10 +15,10 @@ import numpy as np
 from cohdc_train.data.annotations import (
     CocoImage,
     CocoObject,
+    broken_polygons,
     build_object,
-    defect,
-    lost_parts,
-    reaches_out,
+    exceeds_image,
+    find_defect,
     read_segmentation,
 )
 from cohdc_train.data.layout import CocoPaths, SplitPaths, find_split, read_json
@@ -45,9 +45,9 @@ class CocoSplit:
     images: tuple[CocoImage, ...]
     dropped: dict[str, int] = field(default_factory=dict)
     clipped: int = 0
-    lost_parts: int = 0
+    broken_polygons: int = 0
 
-    def relabelled(self, class_names: Sequence[str]) -> "CocoSplit":
+    def with_class_order(self, class_names: Sequence[str]) -> "CocoSplit":
         """The same split under another order of the same names. Raises DataError when the names
         differ.
         """
@@ -80,14 +80,14 @@ class CocoSplit:
         chosen = sorted(np.random.default_rng(0).permutation(len(self.images))[:count])
         return replace(self, images=tuple(self.images[i] for i in chosen))
 
-    def with_objects(self) -> "CocoSplit":
+    def without_empty_images(self) -> "CocoSplit":
         """Return the split without images that have no object."""
         return replace(
             self,
             images=tuple(image for image in self.images if any(not o.crowd for o in image.objects)),
         )
 
-    def losses(self) -> str:
+    def reading_report(self) -> str:
         """What reading left out or cut, counted, in one line; empty when nothing was."""
         parts = [
             f"{number} annotations dropped ({reason})"
@@ -95,7 +95,9 @@ class CocoSplit:
         ]
         parts += [f"{self.clipped} clipped to the image"] if self.clipped else []
         parts += (
-            [f"{self.lost_parts} broken polygons left out of contours"] if self.lost_parts else []
+            [f"{self.broken_polygons} broken polygons left out of contours"]
+            if self.broken_polygons
+            else []
         )
         return f"{self.annotations}: {', '.join(parts)}" if parts else ""
 
@@ -157,7 +159,9 @@ def read_folder(
     train = [read_split("train", files, classes) for files in found]
     names = train[0].class_names
     val = read_split("val", paths.split("val") or find_split(roots[0], "val"), classes)
-    return CocoFolder(tuple(split.relabelled(names) for split in train), val.relabelled(names))
+    return CocoFolder(
+        tuple(split.with_class_order(names) for split in train), val.with_class_order(names)
+    )
 
 
 def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = None) -> CocoSplit:
@@ -182,12 +186,12 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         if label == 0:
             continue
         segmentation = read_segmentation(files.annotations, row, image)
-        reason = defect(row, segmentation, image)
+        reason = find_defect(row, segmentation, image)
         if reason:
             dropped[reason] += 1
             continue
-        lost += lost_parts(row, segmentation)
-        clipped += reaches_out(row.get("bbox"), image)
+        lost += broken_polygons(row, segmentation)
+        clipped += exceeds_image(row.get("bbox"), image)
         objects[image.id].append(build_object(row, label, segmentation, image))
     kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
     if not any(o for image in kept for o in image.objects if not o.crowd):

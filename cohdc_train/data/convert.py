@@ -12,10 +12,10 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from cohdc_train.data.coco import CocoSplit, read_split
-from cohdc_train.data.doctor.annotation_checks import examine
+from cohdc_train.data.doctor.annotation_checks import check_annotation
 from cohdc_train.data.doctor.doctor import summary
-from cohdc_train.data.doctor.issues import KINDS
-from cohdc_train.data.formats.base import Source, SourceImage
+from cohdc_train.data.doctor.issues import ISSUE_KINDS
+from cohdc_train.data.formats.base import SourceDataset, SourceImage
 from cohdc_train.data.formats.labelme import read_labelme
 from cohdc_train.data.formats.via import read_via
 from cohdc_train.data.formats.voc import read_voc
@@ -24,13 +24,13 @@ from cohdc_train.data.layout import find_split
 from cohdc_train.errors import DataError
 from cohdc_train.files import link_or_copy, new_folder, write_text
 
-Format = Literal["labelme", "via", "yolo", "voc"]
+AnnotationFormat = Literal["labelme", "via", "yolo", "voc"]
 _JPEG_QUALITY = 95  # of images that have to be turned
-_UPRIGHT = "image turned as its EXIF says, and written anew"
+_TURNED = "image turned as its EXIF says, and written anew"
 
 
 def convert(
-    format: Format,
+    format: AnnotationFormat,
     source: Path,
     out: Path,
     val: float = 0.2,
@@ -60,16 +60,16 @@ def convert(
     """
     with new_folder(out) as draft:
         found = _read(format, source, attribute, names)
-        splits = _split(source, found, val, seed)
+        splits = _assign_splits(source, found, val, seed)
         classes = found.class_names or sorted(
             {o.name for images in splits.values() for i in images for o in i.objects}
         )
         file_names = _write_images(splits.values(), draft / "images", found)
         for name, images in splits.items():
-            content = _content(images, file_names, classes, found)
+            content = _coco_content(images, file_names, classes, found)
             if not content["annotations"]:
                 lost = "; ".join(
-                    f"{len(places)} left out: {why}" for why, places in found.left_out.items()
+                    f"{len(places)} left out: {why}" for why, places in found.skipped.items()
                 )
                 raise DataError(
                     f"{source}: no object in {name} of {len(images)} images"
@@ -81,12 +81,14 @@ def convert(
     own = "the source's own"
     print("split: " + (f"{drawn}, --val {val} --seed {seed}" if "" in found.splits else own))
     print("\n".join(summary(split) for split in written))
-    _print_counts("left out", found.left_out)
+    _print_counts("left out", found.skipped)
     _print_counts("worth knowing", found.notes)
     print(f"next: cohdc data doctor {out}")
 
 
-def _read(format: Format, source: Path, attribute: str | None, names: Path | None) -> Source:
+def _read(
+    format: AnnotationFormat, source: Path, attribute: str | None, names: Path | None
+) -> SourceDataset:
     if attribute is not None and format != "via":
         raise DataError(f"--attribute is for via, not for {format}")
     if names is not None and format not in ("via", "voc"):
@@ -98,7 +100,9 @@ def _read(format: Format, source: Path, attribute: str | None, names: Path | Non
     return read_yolo(source) if format == "yolo" else read_voc(source, names)
 
 
-def _split(source: Path, found: Source, val: float, seed: int) -> dict[str, list[SourceImage]]:
+def _assign_splits(
+    source: Path, found: SourceDataset, val: float, seed: int
+) -> dict[str, list[SourceImage]]:
     """The source's own split; without one, a share `val` of the images, at least one, drawn by a
     seeded shuffle.
     """
@@ -124,7 +128,7 @@ def _split(source: Path, found: Source, val: float, seed: int) -> dict[str, list
 
 
 def _write_images(
-    splits: Iterable[Sequence[SourceImage]], folder: Path, found: Source
+    splits: Iterable[Sequence[SourceImage]], folder: Path, found: SourceDataset
 ) -> dict[Path, str]:
     """Write every image once; returns its file name by its path in the source.
 
@@ -136,28 +140,28 @@ def _write_images(
     names = {path: path.name if flat else path.relative_to(shared).as_posix() for path in images}
     for path, image in images.items():
         _write_image(image, folder / names[path])
-        if image.upright:
-            found.note(_UPRIGHT, str(path))
+        if image.apply_exif:
+            found.note(_TURNED, str(path))
     return names
 
 
 def _write_image(image: SourceImage, target: Path) -> None:
     """Link, copy, unpack or turn one image."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    if image.upright:
-        with Image.open(io.BytesIO(image.pixels()) if image.pixels else image.path) as picture:
-            ImageOps.exif_transpose(picture).save(target, quality=_JPEG_QUALITY)
+    if image.apply_exif:
+        with Image.open(io.BytesIO(image.pixels()) if image.pixels else image.path) as image_file:
+            ImageOps.exif_transpose(image_file).save(target, quality=_JPEG_QUALITY)
     elif image.pixels:
         target.write_bytes(image.pixels())
     else:
         link_or_copy(image.path, target)
 
 
-def _content(
+def _coco_content(
     images: Sequence[SourceImage],
     file_names: Mapping[Path, str],
     classes: Sequence[str],
-    found: Source,
+    found: SourceDataset,
 ) -> dict[str, Any]:
     """The COCO dict of a split. Objects without a pixel are left out; what reaches out of the image
     is cut off.
@@ -169,10 +173,10 @@ def _content(
         size = {"width": image.width, "height": image.height}
         rows.append({"id": image_id, "file_name": file_names[image.path], **size})
         for o in image.objects:
-            seen = examine({"segmentation": o.segmentation}, image.height, image.width)
-            kinds = [KINDS[kind].what for kind in seen.findings if kind != "box-missing"]
+            seen = check_annotation({"segmentation": o.segmentation}, image.height, image.width)
+            kinds = [ISSUE_KINDS[kind].description for kind in seen.issues if kind != "box-missing"]
             if seen.row is None:
-                found.leave_out(kinds.pop(), o.where)
+                found.skip(kinds.pop(), o.where)
             else:
                 owner = {
                     "id": len(annotations) + 1,

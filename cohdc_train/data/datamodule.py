@@ -19,7 +19,7 @@ from cohdc_train.data.annotations import CocoImage, read_image
 from cohdc_train.data.canvas import choose_canvas
 from cohdc_train.data.coco import CocoFolder, CocoSplit, read_folder, read_split
 from cohdc_train.data.layout import CocoPaths, find_split
-from cohdc_train.data.train_dataset import CocoTrainSet, Target
+from cohdc_train.data.train_dataset import CocoTrainDataset, Target
 from cohdc_train.data.transforms import Augmentation, blank_padding, photometric_augmentation
 from cohdc_train.errors import DataError
 
@@ -41,7 +41,7 @@ class Subset:
     val: int | None = None
 
 
-_EVERYTHING = Subset()
+_ALL_IMAGES = Subset()
 
 
 class TrainBatch(NamedTuple):
@@ -59,7 +59,7 @@ class TrainBatch(NamedTuple):
     targets: list[Target]
 
 
-class CocoValSet(Dataset[ValSample]):
+class CocoValDataset(Dataset[ValSample]):
     """Validation images as they are on disk."""
 
     def __init__(self, split: CocoSplit) -> None:
@@ -111,9 +111,9 @@ class CocoDataModule(pl.LightningDataModule):
         workers: int = 1,
         augment: Augmentation = _AUGMENTATION,
         mini_mask: tuple[int, int] | None = None,
-        subset: Subset = _EVERYTHING,
+        subset: Subset = _ALL_IMAGES,
         overfit: int = 0,
-        cutouts: list[Path] | None = None,
+        paste_roots: list[Path] | None = None,
         paths: CocoPaths | None = None,
     ) -> None:
         super().__init__()
@@ -138,10 +138,10 @@ class CocoDataModule(pl.LightningDataModule):
             self.augment = augment = Augmentation(
                 flip=0.0, scale_jitter=(1.0, 1.0), photometric=False
             )
-        self.cutouts = cutouts or []
-        if self.cutouts and not augment.copy_paste:
+        self.paste_roots = paste_roots or []
+        if self.paste_roots and not augment.copy_paste:
             raise DataError(
-                "data.cutouts are pasted nowhere: give data.augment.copy_paste, a probability"
+                "data.paste_roots are pasted nowhere: give data.augment.copy_paste, a probability"
             )
         self.paths = paths
         self._folder: CocoFolder | None = None
@@ -155,7 +155,7 @@ class CocoDataModule(pl.LightningDataModule):
             train = tuple(split.subset(self.subset.train) for split in whole.train)
             self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
             if self.overfit:
-                same = train[0].with_objects().subset(self.overfit)
+                same = train[0].without_empty_images().subset(self.overfit)
                 self._folder = CocoFolder((same,), same)
         return self._folder
 
@@ -168,12 +168,16 @@ class CocoDataModule(pl.LightningDataModule):
         return self._canvas
 
     @cached_property
-    def givers(self) -> tuple[CocoSplit, ...]:
+    def paste_sources(self) -> tuple[CocoSplit, ...]:
         """The training splits whose objects are pasted: those of `root` and of `cutouts`."""
         given = [
-            read_split("train", find_split(root, "train"), self.classes) for root in self.cutouts
+            read_split("train", find_split(root, "train"), self.classes)
+            for root in self.paste_roots
         ]
-        return (*self.folder.train, *(split.relabelled(self.folder.class_names) for split in given))
+        return (
+            *self.folder.train,
+            *(split.with_class_order(self.folder.class_names) for split in given),
+        )
 
     @property
     def class_names(self) -> list[str]:
@@ -191,12 +195,12 @@ class CocoDataModule(pl.LightningDataModule):
 
         Raises DataError naming an image that is missing, damaged or not of its annotated size.
         """
-        splits = [self.folder.val, *(self.givers if stage == "fit" else ())]
+        splits = [self.folder.val, *(self.paste_sources if stage == "fit" else ())]
         for split in splits:
-            if split.losses():
-                rank_zero_info(split.losses())
+            if split.reading_report():
+                rank_zero_info(split.reading_report())
             for image in split.images:
-                image_files.check(image.path, image.id, (image.width, image.height))
+                image_files.check_image(image.path, image.id, (image.width, image.height))
 
     @cached_property
     def val_ground_truth(self) -> dict[str, Any]:
@@ -205,13 +209,15 @@ class CocoDataModule(pl.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled batches of `TrainBatch`; the order and every draw follow torch's seed."""
-        images, givers = _images(self.folder.train), _images(self.givers)
-        training = CocoTrainSet(images, self.canvas, self.augment, self.mini_mask, givers)
+        images, paste_sources = _images(self.folder.train), _images(self.paste_sources)
+        training = CocoTrainDataset(
+            images, self.canvas, self.augment, self.mini_mask, paste_sources
+        )
         return self._loader(training, shuffle=True, collate=_collate_train)
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Batches [(image uint8 [3, height, width], image id), ...]."""
-        return self._loader(CocoValSet(self.folder.val), shuffle=False, collate=list)
+        return self._loader(CocoValDataset(self.folder.val), shuffle=False, collate=list)
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         """Training images to float32 in 0..1, unless switched off with kornia's photometry; padding
@@ -241,7 +247,7 @@ class CocoDataModule(pl.LightningDataModule):
             shuffle=shuffle,
             num_workers=self.workers,
             collate_fn=collate,
-            worker_init_fn=_start_worker,
+            worker_init_fn=_init_worker,
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.workers > 0,
         )
@@ -257,5 +263,5 @@ def _collate_train(samples: Sequence[tuple[Tensor, Target]]) -> TrainBatch:
     )
 
 
-def _start_worker(worker: int) -> None:
+def _init_worker(worker: int) -> None:
     cv2.setNumThreads(0)  # OpenCV's threads in every worker would fight for the cores

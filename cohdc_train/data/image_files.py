@@ -36,12 +36,12 @@ class ImageFile(NamedTuple):
 
     stored: width and height in px, before any turning by EXIF; 0 when it cannot be read.
     orientation: EXIF's, 1..8; 1 is upright.
-    plain: 8-bit grey, palette or RGB. problem: "", "missing", "corrupt" or "truncated".
+    plain: 8-bit gray, palette or RGB. problem: "", "missing", "corrupt" or "truncated".
     """
 
     stored: Size = (0, 0)
     orientation: int = 1
-    plain: bool = True
+    is_8bit: bool = True
     problem: str = ""
 
     @property
@@ -59,7 +59,7 @@ class ImageFile(NamedTuple):
         return self.upright if self.is_turned(annotated) else self.stored
 
 
-def look(path: Path, decode: bool = False) -> ImageFile:
+def read_image_file(path: Path, decode: bool = False) -> ImageFile:
     """Read a file's header and end; with `decode` all of it, which finds damage in between too."""
     if not path.is_file():
         return ImageFile(problem="missing")
@@ -77,9 +77,9 @@ def look(path: Path, decode: bool = False) -> ImageFile:
     return facts
 
 
-def check(path: Path, image_id: int, size: Size) -> None:
+def check_image(path: Path, image_id: int, size: Size) -> None:
     """Raise DataError naming file and id unless it can be read at the annotated size."""
-    file = look(path)
+    file = read_image_file(path)
     if file.problem:
         raise DataError(f"{path}: image {image_id} {PROBLEMS[file.problem]}")
     check_size(path, image_id, file.size_for(size), size)
@@ -95,9 +95,9 @@ def check_size(path: Path, image_id: int, found: Size, annotated: Size) -> None:
 
 
 def fingerprint(path: Path) -> Float32Array:
-    """Return [256] grey values of the upright image at 16x16, of mean 0 and norm 1.
+    """Return [256] gray values of the upright image at 16x16, of mean 0 and norm 1.
 
-    The product of two compares the images. All values are 0 for an image of one grey.
+    The product of two compares the images. All values are 0 for an image of one gray.
     """
     with Image.open(path) as image:
         orientation = orientation_of(image)
@@ -108,7 +108,7 @@ def fingerprint(path: Path) -> Float32Array:
     return values / max(float(np.linalg.norm(values)), 1e-6)
 
 
-def mirrored(prints: Float32Array) -> Float32Array:
+def mirror_fingerprints(prints: Float32Array) -> Float32Array:
     """Fingerprints [N, 256] of the same pictures, flipped left to right."""
     return prints.reshape(-1, _SIDE, _SIDE)[:, :, ::-1].reshape(-1, _SIDE * _SIDE)
 

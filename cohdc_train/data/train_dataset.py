@@ -15,8 +15,8 @@ from cohdc_train.data.annotations import CocoImage, CocoObject, read_image
 from cohdc_train.data.transforms import Augmentation, Placement, mask_boxes
 
 Target = dict[str, Any]
-_PASTED = 8  # objects at most that one image gives to another
-_LEFT = 0.1  # share of an object that must still be seen behind what is pasted over it, or it is ignored
+_MAX_PASTED = 8  # objects at most that one image gives to another
+_MIN_VISIBLE = 0.1  # share of an object that must still be seen behind what is pasted over it, or it is ignored
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class _Scene:
     objects: Iterable[tuple[int, Tensor]]
 
 
-class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
+class CocoTrainDataset(Dataset[tuple[Tensor, Target]]):
     """Augmented training images on the canvas, with boxes recomputed from what is left of the
     masks.
 
@@ -47,10 +47,10 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         canvas: tuple[int, int],
         augment: Augmentation,
         mini_mask: tuple[int, int] | None = None,
-        givers: Sequence[CocoImage] | None = None,
+        paste_sources: Sequence[CocoImage] | None = None,
     ) -> None:
         self.images = images
-        self.givers = givers or images
+        self.paste_sources = paste_sources or images
         self.canvas = canvas
         self.augment = augment
         self.mini_mask = mini_mask
@@ -63,7 +63,9 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         image = self.images[index]
         scene = self._place(image, [o for o in image.objects if not o.crowd])
         if self.augment.copy_paste > 0 and torch.rand(()) < self.augment.copy_paste:
-            scene = self._paste(self.givers[int(torch.randint(len(self.givers), ()))], scene)
+            scene = self._paste(
+                self.paste_sources[int(torch.randint(len(self.paste_sources), ()))], scene
+            )
         return scene.image, self._target(scene, image.id)
 
     def _place(self, image: CocoImage, objects: Sequence[CocoObject]) -> _Scene:
@@ -81,21 +83,21 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
     def _paste(self, giver: CocoImage, scene: _Scene) -> _Scene:
         """Some objects of another image over the scene (Ghiasi et al. 2021, copy-paste)."""
         whole = [o for o in giver.objects if not o.crowd]
-        order = torch.randperm(len(whole))[: int(torch.randint(1, _PASTED + 1, ()))]
+        order = torch.randperm(len(whole))[: int(torch.randint(1, _MAX_PASTED + 1, ()))]
         given = self._place(giver, [whole[i] for i in order])
         height, width = scene.size
         objects = []
-        over = torch.zeros(self.canvas, dtype=torch.bool)
+        occluder = torch.zeros(self.canvas, dtype=torch.bool)
         for label, mask in given.objects:
             mask[height:], mask[:, width:] = 0, 0
             objects.append((label, mask))
-            over |= mask > 0
+            occluder |= mask > 0
         hidden: list[Tensor] = []
-        behind = list(_behind(scene.objects, over, hidden))
+        behind = list(_occlude(scene.objects, occluder, hidden))
         ignore = torch.cat(
             [scene.ignore, mask_boxes(torch.stack(hidden)) if hidden else scene.ignore[:0]]
         )
-        image = torch.where(over, given.image, scene.image)
+        image = torch.where(occluder, given.image, scene.image)
         return replace(scene, image=image, ignore=ignore, objects=behind + objects)
 
     def _target(self, scene: _Scene, image_id: int) -> Target:
@@ -110,7 +112,9 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
             if box[0, 2] > box[0, 0]:
                 labels.append(label)
                 masks.append(
-                    mask[None] if self.mini_mask is None else _minimised(mask, box, self.mini_mask)
+                    mask[None]
+                    if self.mini_mask is None
+                    else _make_mini_mask(mask, box, self.mini_mask)
                 )
                 boxes.append(box)
         ignore = scene.ignore
@@ -125,19 +129,19 @@ class CocoTrainSet(Dataset[tuple[Tensor, Target]]):
         return target if self.mini_mask is None else target | {"frames": target["boxes"]}
 
 
-def _behind(
-    objects: Iterable[tuple[int, Tensor]], over: Tensor, hidden: list[Tensor]
+def _occlude(
+    objects: Iterable[tuple[int, Tensor]], occluder: Tensor, hidden: list[Tensor]
 ) -> Iterator[tuple[int, Tensor]]:
     """What still shows of objects behind `over`; the rests of those that hardly do go to `hidden`."""
     for label, mask in objects:
-        left = mask * ~over
-        if left.sum() >= _LEFT * mask.sum():
+        left = mask * ~occluder
+        if left.sum() >= _MIN_VISIBLE * mask.sum():
             yield label, left
         else:
             hidden.append(left)
 
 
-def _minimised(mask: Tensor, box: Tensor, size: tuple[int, int]) -> Tensor:
+def _make_mini_mask(mask: Tensor, box: Tensor, size: tuple[int, int]) -> Tensor:
     """float16 [1, *size]: share of each cell of a grid over its box [1, 4] that a mask [H, W]
     covers.
     """

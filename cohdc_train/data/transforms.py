@@ -30,7 +30,7 @@ class Augmentation:
         scale_jitter: smallest and largest scale, relative to the one at which the image just fits
             into the canvas; drawn per image, it is the multi-scale training.
         copy_paste: probability that objects of another training image are pasted over this one.
-        photometric: vary brightness, contrast, colour temperature, noise and blur on the device.
+        photometric: vary brightness, contrast, color temperature, noise and blur on the device.
         degrade: probability of each fault that a moving camera's image has: gamma, light that
             changes across it (a rolling shutter's exposure), motion blur, noise and JPEG.
     """
@@ -56,7 +56,7 @@ class Placement:
     mirrored; zeros elsewhere.
 
     The window is cut before it is resized, so that no pixel is computed that would be thrown away.
-    Images are resized bilinearly with antialiasing; masks take the nearest pixel, centre to centre
+    Images are resized bilinearly with antialiasing; masks take the nearest pixel, center to center
     (v2's own rule for masks is half a pixel off).
 
     Attributes:
@@ -142,10 +142,10 @@ def mask_boxes(masks: Tensor) -> Tensor:
 
 
 def photometric_augmentation(augment: Augmentation) -> AugmentationSequential | None:
-    """Colour, noise, blur and a camera's faults for float images [B, 3, H, W] in 0..1, drawn per
+    """Color, noise, blur and a camera's faults for float images [B, 3, H, W] in 0..1, drawn per
     image; None for none.
 
-    Colour varies by the temperature of the light: hue and saturation, through HSV, cost five times
+    Color varies by the temperature of the light: hue and saturation, through HSV, cost five times
     as much as the rest.
     """
     steps: list[IntensityAugmentationBase2D] = []

@@ -73,7 +73,7 @@ def tum(
     sequence = _sequence(name)
     folder = out / f"{_PREFIX}{sequence}"
     if folder.is_dir():
-        print(f"{folder}: {_check(folder)} images, already there")
+        print(f"{folder}: {_check_complete(folder)} images, already there")
         return folder
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: is not a folder")
@@ -89,7 +89,7 @@ def tum(
             raise DataError(f"{file}: SHA-256 {found}, expected {digest.lower()}")
         with new_folder(folder) as draft:
             _unpack(file, folder.name, draft)
-            count = _check(draft, file)
+            count = _check_complete(draft, file)
     except DataError as error:
         if archive is not None:
             raise
@@ -117,16 +117,18 @@ def _sequence(name: str) -> str:
 def _download(url: str, file: Path) -> None:
     """To FILE.part, from its end on where there is one, renamed when it is whole."""
     part = file.with_name(file.name + ".part")
-    have = part.stat().st_size if part.is_file() else 0
+    num_bytes = part.stat().st_size if part.is_file() else 0
     try:
-        request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            if have and answer.status != 206:  # the host gives the whole file again
-                have = 0
-            length = answer.headers.get("Content-Length")
-            total = None if length is None else have + int(length)
-            with part.open("ab" if have else "wb") as stream:
-                _copy(answer, stream, have, total)
+        request = urllib.request.Request(
+            url, headers={"Range": f"bytes={num_bytes}-"} if num_bytes else {}
+        )
+        with urllib.request.urlopen(request, timeout=60) as response:
+            if num_bytes and response.status != 206:  # the host gives the whole file again
+                num_bytes = 0
+            length = response.headers.get("Content-Length")
+            total = None if length is None else num_bytes + int(length)
+            with part.open("ab" if num_bytes else "wb") as stream:
+                _copy(response, stream, num_bytes, total)
     except (OSError, HTTPException, ValueError) as error:
         if (
             getattr(error, "code", None) == 416
@@ -144,14 +146,14 @@ def _download(url: str, file: Path) -> None:
     return None
 
 
-def _copy(answer: Any, stream: Any, done: int, total: int | None) -> None:
-    told = 0
-    while chunk := answer.read(_CHUNK):
+def _copy(response: Any, stream: Any, done: int, total: int | None) -> None:
+    printed_tenths = 0
+    while chunk := response.read(_CHUNK):
         stream.write(chunk)
         done += len(chunk)
-        if total and 10 * done // total > told:
-            told = 10 * done // total
-            print(f"{10 * told} % of {total / 1e6:.0f} MB", flush=True)
+        if total and 10 * done // total > printed_tenths:
+            printed_tenths = 10 * done // total
+            print(f"{10 * printed_tenths} % of {total / 1e6:.0f} MB", flush=True)
 
 
 def _unpack(file: Path, inside: str, target: Path) -> None:
@@ -184,7 +186,7 @@ def _unpack(file: Path, inside: str, target: Path) -> None:
         ) from error
 
 
-def _check(folder: Path, named: Path | None = None) -> int:
+def _check_complete(folder: Path, named: Path | None = None) -> int:
     """How many images the lists name, all of them there. Raises DataError naming the first thing
     that is missing.
     """

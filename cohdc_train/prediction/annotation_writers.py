@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import yaml
 
-from cohdc_train.contour import Polygon, joined
+from cohdc_train.contour import Polygon, join_polygons
 from cohdc_train.drawing import encode_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.files import OwnFiles, write_bytes, write_text
@@ -234,7 +234,7 @@ class _Yolo:
         height, width = one.size
         lines = []
         for label, outline in zip(one.found.labels.tolist(), one.outlines, strict=True):
-            shares = (joined(outline) / (width, height)).ravel()
+            shares = (join_polygons(outline) / (width, height)).ravel()
             lines.append(
                 " ".join(
                     [str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.contour import Method, Polygon, simplify, trace
+from cohdc_train.contour import ContourMethod, Polygon, simplify, trace
 from cohdc_train.drawing import encode_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.files import OwnFiles, claim_folder, write_bytes
@@ -40,7 +40,7 @@ def predict(
     score: float = 0.5,
     quality: float | None = None,
     format: Format = "coco",
-    contour: Method = "bas_dp",
+    contour: ContourMethod = "bas_dp",
     iou_floor: float = 0.95,
     check_below: float = 0.7,
     threads: int = 0,
@@ -110,7 +110,7 @@ def predict_pictures(
     least: tuple[float, float | None] = (0.5, None),
     iou_floor: float = 0.95,
     *,
-    contour: Method = "bas_dp",
+    contour: ContourMethod = "bas_dp",
     format: Format = "coco",
     check_below: float = 0.7,
 ) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def predict_pictures(
     return content
 
 
-def _outline(mask: NDArray[np.bool_], iou_floor: float, contour: Method) -> list[Polygon]:
+def _outline(mask: NDArray[np.bool_], iou_floor: float, contour: ContourMethod) -> list[Polygon]:
     """A mask's polygons; exact ones where a fixed tolerance leaves nothing. Empty for an empty
     mask.
     """

@@ -39,7 +39,7 @@ class Actor(Protocol):
         ...
 
 
-def scattered(mesh: Mesh) -> FloatArray:
+def sample_points(mesh: Mesh) -> FloatArray:
     """[7 T, 3] points spread over the triangles of `mesh`."""
     points: FloatArray = np.einsum("bk,tki->tbi", _BLENDS, mesh.corners).reshape(-1, 3)
     return points
@@ -61,11 +61,11 @@ class Walker:
 
     @cached_property
     def _figure(self) -> FloatArray:
-        return scattered(bodies.person_mesh(self.person, bodies.walking(0.6), (0.0, 0.0), 0.0))
+        return sample_points(bodies.person_mesh(self.person, bodies.walking(0.6), (0.0, 0.0), 0.0))
 
     def mesh(self, frame: int) -> Mesh:
         """The person in the walk cycle."""
-        phase = 2 * np.pi * self.walk.travelled[frame] / bodies.stride(self.person)
+        phase = 2 * np.pi * self.walk.distance_walked[frame] / bodies.stride(self.person)
         pose = bodies.walking(float(phase), float(self.walk.pace[frame]))
         if self.pushes:
             pose = replace(pose, shoulders=(0.8, 0.8), elbows=(0.55, 0.55))
@@ -74,11 +74,11 @@ class Walker:
 
     def points(self, frame: int) -> FloatArray:
         """The person in one pose."""
-        return _carried(self._figure, self.walk, frame)
+        return _place_points(self._figure, self.walk, frame)
 
 
 @dataclass(frozen=True)
-class Sitter:
+class SeatedPerson:
     """A person who sits. place: (x, y) m; fidget, gesture: [n] as `people.sitting` takes them."""
 
     person: bodies.Person
@@ -100,7 +100,7 @@ class Sitter:
 
     @cached_property
     def _figure(self) -> FloatArray:
-        return scattered(self.mesh(0))
+        return sample_points(self.mesh(0))
 
     def points(self, frame: int) -> FloatArray:
         """The seated person, whose fidgeting is no matter here."""
@@ -108,7 +108,7 @@ class Sitter:
 
 
 @dataclass(frozen=True)
-class Thing:
+class MovableObject:
     """A cart or a chair. body: its triangles in its own frame."""
 
     body: Mesh
@@ -119,14 +119,14 @@ class Thing:
     def mesh(self, frame: int) -> Mesh:
         """The thing where it is."""
         place = (*self.walk.position[frame], 0.0)
-        return self.body.moved(yaw_rotation(float(self.walk.heading[frame])), place)
+        return self.body.transformed(yaw_rotation(float(self.walk.heading[frame])), place)
 
     def points(self, frame: int) -> FloatArray:
         """The same."""
-        return scattered(self.mesh(frame))
+        return sample_points(self.mesh(frame))
 
 
-def _carried(points: FloatArray, walk: Walk, frame: int) -> FloatArray:
+def _place_points(points: FloatArray, walk: Walk, frame: int) -> FloatArray:
     """Points of a body where the walk has got to."""
     carried: FloatArray = points @ yaw_rotation(walk.heading[frame]).T + np.array(
         [*walk.position[frame], 0.0]
@@ -134,7 +134,7 @@ def _carried(points: FloatArray, walk: Walk, frame: int) -> FloatArray:
     return carried
 
 
-def fastest(actor: Actor, frame: int, frames: int, rate: float) -> float:
+def max_speed(actor: Actor, frame: int, frames: int, rate: float) -> float:
     """Speed of the fastest corner of `actor` between this frame and the next (the last two at the
     end), m/s.
     """

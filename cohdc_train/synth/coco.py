@@ -16,9 +16,9 @@ from cohdc_train.synth.coco_annotation import annotate
 from cohdc_train.synth.mesh import join
 from cohdc_train.synth.option_checks import check_size_and_seed
 from cohdc_train.synth.random_streams import stream
-from cohdc_train.synth.renderer import Atlas, Camera, render
+from cohdc_train.synth.renderer import Atlas, RenderCamera, render
 from cohdc_train.synth.room import Lighting, Room, furnished_room, texture_detail
-from cohdc_train.synth.sensor import exposure, photograph, smear
+from cohdc_train.synth.sensor import add_sensor_noise, blur_motion, exposure_gain
 from cohdc_train.types import Float32Array, FloatArray, Image, Int32Array, Mask
 
 IMAGES_PER_ROOM = 5
@@ -37,7 +37,7 @@ _COUNT_CHANCE = (0.08, 0.42, 0.34, 0.16)  # of 0, 1, .. 3 people
 
 
 @dataclass(frozen=True)
-class Picture:
+class LabeledImage:
     """image: [H, W, 3] uint8 RGB; masks: [n, H, W] bool, the visible part of every person who has
     one.
     """
@@ -47,7 +47,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Stage:
+class PopulatedRoom:
     """A room with the people who may appear in it."""
 
     room: Room
@@ -55,7 +55,7 @@ class Stage:
     atlas: Atlas
 
 
-def draw_stage(rng: np.random.Generator, detail: int) -> Stage:
+def draw_populated_room(rng: np.random.Generator, detail: int) -> PopulatedRoom:
     """A room of its own and three people; detail as in `furnished_room`."""
     size = (
         float(rng.uniform(4.5, 7.5)),
@@ -65,30 +65,32 @@ def draw_stage(rng: np.random.Generator, detail: int) -> Stage:
     room = furnished_room(rng, size, float(rng.uniform(1.8, size[1] - 1.3)), detail)
     people = tuple(bodies.draw_person(rng) for _ in range(PEOPLE_PER_ROOM))
     atlas = Atlas([*room.textures, *(look for person in people for look in person.textures)])
-    return Stage(room, people, atlas)
+    return PopulatedRoom(room, people, atlas)
 
 
-def take_picture(
-    stage: Stage,
+def render_image(
+    room_with_people: PopulatedRoom,
     rng: np.random.Generator,
     size: tuple[int, int],
     distance: tuple[float, float] = DISTANCE,
-) -> Picture:
+) -> LabeledImage:
     """One picture by a hand-held camera somewhere in the room. size: (height, width), px; distance:
     of people, m.
     """
-    camera = Camera.freiburg3(size).resized(SUPERSAMPLING)
-    T_wc = _camera_pose(stage.room, rng)
-    room = stage.room
+    camera = RenderCamera.freiburg3(size).resized(SUPERSAMPLING)
+    T_wc = _camera_pose(room_with_people.room, rng)
+    room = room_with_people.room
     meshes = [room.mesh]
-    for k, place in enumerate(_places(room, rng, T_wc, distance)):
-        person = stage.people[k]
+    for k, place in enumerate(_draw_positions(room, rng, T_wc, distance)):
+        person = room_with_people.people[k]
         body = bodies.person_mesh(
             person, bodies.draw_pose(rng), place, float(rng.uniform(0, 2 * np.pi))
         )
         meshes.append(body.named(k + 1, len(room.textures) + 6 * k))
-    view = render(join(meshes), stage.atlas, _relit(room.lighting, rng), camera, T_wc)
-    return Picture(_developed(view.rgb, rng, size), _visible(view.instance, size))
+    view = render(
+        join(meshes), room_with_people.atlas, _vary_lighting(room.lighting, rng), camera, T_wc
+    )
+    return LabeledImage(_expose(view.rgb, rng, size), _visible_masks(view.instance, size))
 
 
 def _camera_pose(room: Room, rng: np.random.Generator) -> FloatArray:
@@ -109,7 +111,7 @@ def _camera_pose(room: Room, rng: np.random.Generator) -> FloatArray:
     return pose
 
 
-def _places(
+def _draw_positions(
     room: Room, rng: np.random.Generator, T_wc: FloatArray, distances: tuple[float, float]
 ) -> list[tuple[float, float]]:
     """Free spots in front of the camera for 0-3 people, the outermost cut by the image's border."""
@@ -134,28 +136,30 @@ def _places(
     return found
 
 
-def _relit(lighting: Lighting, rng: np.random.Generator) -> Lighting:
+def _vary_lighting(lighting: Lighting, rng: np.random.Generator) -> Lighting:
     """Each lamp turned up or down against the ambient light, all warmer or colder."""
     gain = np.exp(rng.normal(0, 0.3, (len(lighting.lamps), 1))).astype(np.float32)
     tint = (1 + rng.normal(0, 0.04, 3)).astype(np.float32)
     return Lighting(lighting.lamps, lighting.power * gain * tint, lighting.ambient * tint)
 
 
-def _developed(rgb: Float32Array, rng: np.random.Generator, size: tuple[int, int]) -> Image:
+def _expose(rgb: Float32Array, rng: np.random.Generator, size: tuple[int, int]) -> Image:
     """The supersampled rendering as a photograph of `size`: exposure, motion blur in a third,
     optics, noise.
     """
-    rgb = np.minimum(rgb * np.float32(exposure(rgb, 0.4 * float(np.exp(rng.normal(0, 0.25))))), 1)
+    rgb = np.minimum(
+        rgb * np.float32(exposure_gain(rgb, 0.4 * float(np.exp(rng.normal(0, 0.25))))), 1
+    )
     scale = size[1] / 256
     if rng.random() < 0.33:
-        rgb = smear(
+        rgb = blur_motion(
             rgb, SUPERSAMPLING * scale * float(rng.uniform(1.5, 6)), float(rng.uniform(0, np.pi))
         )
     small = cv2.resize(rgb, (size[1], size[0]), interpolation=cv2.INTER_AREA).astype(np.float32)
-    return photograph(small, rng, float(rng.uniform(0.5, 3.5)), float(rng.uniform(0, 0.5)))
+    return add_sensor_noise(small, rng, float(rng.uniform(0.5, 3.5)), float(rng.uniform(0, 0.5)))
 
 
-def _visible(instance: Int32Array, size: tuple[int, int]) -> Mask:
+def _visible_masks(instance: Int32Array, size: tuple[int, int]) -> Mask:
     """[n, H, W] who covers at least half of a pixel; no pixel has two owners."""
     masks = []
     free = np.ones(size, dtype=np.bool_)
@@ -229,9 +233,9 @@ def _render_split(
     annotations: list[dict[str, Any]] = []
     for first in range(0, number, IMAGES_PER_ROOM):
         rng = stream(seed, f"coco-{split}", first // IMAGES_PER_ROOM)
-        stage = draw_stage(rng, texture_detail(size))
+        room_with_people = draw_populated_room(rng, texture_detail(size))
         for image_id in range(first + 1, min(first + IMAGES_PER_ROOM, number) + 1):
-            picture = take_picture(stage, rng, size, distance)
+            picture = render_image(room_with_people, rng, size, distance)
             name = f"{split}_{image_id:06d}.jpg"
             write_jpeg(folder / "images" / name, picture.image, _JPEG_QUALITY)
             images.append({"id": image_id, "file_name": name, "height": size[0], "width": size[1]})

@@ -6,7 +6,13 @@ import numpy as np
 
 from cohdc_train.synth import mesh as solids
 from cohdc_train.synth.mesh import Mesh
-from cohdc_train.synth.textures import Texture, carton, letters, poster, wood
+from cohdc_train.synth.textures import (
+    Texture,
+    carton_texture,
+    poster_texture,
+    wood_texture,
+    write_letters,
+)
 
 HANDLE = -0.47  # m: where along x a cart's handle stands
 _SIDE = 256  # px of a texture
@@ -27,7 +33,7 @@ def chair(seat: float) -> Mesh:
 
 def chair_texture(rng: np.random.Generator) -> Texture:
     """What a chair is made of."""
-    return wood(rng, _SIDE, _SIDE)
+    return wood_texture(rng, _SIDE, _SIDE)
 
 
 def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
@@ -36,9 +42,9 @@ def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
     """
     looks = (
         _metal(rng),
-        carton(rng, _SIDE, _SIDE),
-        poster(rng, _SIDE, _SIDE),
-        carton(rng, _SIDE, _SIDE),
+        carton_texture(rng, _SIDE, _SIDE),
+        poster_texture(rng, _SIDE, _SIDE),
+        carton_texture(rng, _SIDE, _SIDE),
     )
     parts = [solids.box((0, 0, 0.2), (1.0, 0.6, 0.05), 0, 0, 0)]
     for x in (-0.4, 0.4):
@@ -68,5 +74,5 @@ def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
 def _metal(rng: np.random.Generator) -> Texture:
     """Painted metal with a label."""
     image = np.full((_SIDE, _SIDE, 3), rng.uniform(60, 190), dtype=np.float32)
-    letters(image, rng, 2)
+    write_letters(image, rng, 2)
     return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)

@@ -28,7 +28,7 @@ class Mesh:
     texture: Int32Array
     instance: Int32Array
 
-    def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Mesh":
+    def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> "Mesh":
         """The mesh in another frame: rotation [3, 3], translation [3] m."""
         turn = np.asarray(rotation, dtype=np.float32).T
         shift = np.asarray(translation, dtype=np.float32)
@@ -69,11 +69,11 @@ def grid(points: Float32Array, texture: int, closed: bool) -> Mesh:
     """The surface through a grid of points, smooth normals.
 
     points: [R, S, 3] m. closed: the last column meets the first (a tube); uv then runs once around
-    along u. Normals of a closed surface point away from the line through the rings' centres, those
+    along u. Normals of a closed surface point away from the line through the rings' centers, those
     of an open one to where u is seen running to the right and v down.
     """
     ring = np.concatenate([points, points[:, :1]], axis=1) if closed else points
-    faces, uv = _topology(ring.shape[0], ring.shape[1])
+    faces, uv = _grid_faces(ring.shape[0], ring.shape[1])
     along = _differences(ring)
     if closed:
         wrapped = np.concatenate([points[:, -1:], points, points[:, :2]], axis=1)
@@ -96,7 +96,7 @@ def grid(points: Float32Array, texture: int, closed: bool) -> Mesh:
 
 
 @lru_cache(maxsize=32)
-def _topology(rows: int, columns: int) -> tuple[IntArray, Float32Array]:
+def _grid_faces(rows: int, columns: int) -> tuple[IntArray, Float32Array]:
     """Faces [T, 3] over a grid of vertices, and their uv [T, 3, 2]."""
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -107,7 +107,7 @@ def _topology(rows: int, columns: int) -> tuple[IntArray, Float32Array]:
     return faces, np.stack([u, v], -1).reshape(-1, 2)[faces].astype(np.float32)
 
 
-def _unit(vectors: Float32Array) -> Float32Array:
+def _normalize(vectors: Float32Array) -> Float32Array:
     """[n, 3] scaled to length 1."""
     scaled: Float32Array = (
         vectors / np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), 1e-9)[:, None]
@@ -136,8 +136,8 @@ def quad(origin: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, texture: int) 
     )
 
 
-def box(centre: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> Mesh:
-    """A box turned by `yaw` rad about z; `centre` [3] and `size` [3] m; textures of its sides and
+def box(center: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> Mesh:
+    """A box turned by `yaw` rad about z; `center` [3] and `size` [3] m; textures of its sides and
     of its top.
     """
     x, y, z = (float(v) / 2 for v in np.asarray(size, dtype=np.float32))
@@ -149,27 +149,27 @@ def box(centre: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> 
         quad((-x, y, z), (2 * x, 0, 0), (0, -2 * y, 0), top),
         quad((-x, -y, -z), (2 * x, 0, 0), (0, 2 * y, 0), top),
     ]
-    return join(faces).moved(yaw_rotation(yaw), centre)
+    return join(faces).transformed(yaw_rotation(yaw), center)
 
 
 def tube(
-    centres: Float32Array, radii: Float32Array, side: ArrayLike, texture: int, segments: int = 12
+    centers: Float32Array, radii: Float32Array, side: ArrayLike, texture: int, segments: int = 12
 ) -> Mesh:
     """A closed tube of elliptic rings.
 
-    centres: [R, 3] m; radii: [R, 2] m along `side` (made orthogonal to the tube) and across it.
+    centers: [R, 3] m; radii: [R, 2] m along `side` (made orthogonal to the tube) and across it.
     u = 0.5 lies on the ring's across axis, side x tangent.
     """
     across = np.asarray(side, dtype=np.float32)
-    tangent = _unit(_differences(centres))
-    wide = _unit(across - tangent * (tangent @ across)[:, None])
+    tangent = _normalize(_differences(centers))
+    wide = _normalize(across - tangent * (tangent @ across)[:, None])
     deep = _cross(wide, tangent)
     angle = 2 * np.pi * np.arange(segments) / segments - np.pi
     offsets = (
         np.cos(angle)[None, :, None] * (deep * radii[:, 1:])[:, None]
         + np.sin(angle)[None, :, None] * (wide * radii[:, :1])[:, None]
     )
-    return grid((centres[:, None] + offsets).astype(np.float32), texture, closed=True)
+    return grid((centers[:, None] + offsets).astype(np.float32), texture, closed=True)
 
 
 def capsule(
@@ -192,17 +192,17 @@ def capsule(
     t = np.linspace(0, 1, 5)
     middle = radii[0] + (radii[1] - radii[0]) * t + 0.12 * radii[0] * np.sin(np.pi * t**0.8)
     r = np.concatenate([radii[0] * np.cos(cap), middle, radii[1] * np.cos(cap[::-1])])
-    centres = (a + reach[:, None] * axis).astype(np.float32)
-    return tube(centres, np.stack([r, r], 1).astype(np.float32), side, texture, segments=10)
+    centers = (a + reach[:, None] * axis).astype(np.float32)
+    return tube(centers, np.stack([r, r], 1).astype(np.float32), side, texture, segments=10)
 
 
-def ellipsoid(centre: ArrayLike, radii: tuple[float, float, float], texture: int) -> Mesh:
+def ellipsoid(center: ArrayLike, radii: tuple[float, float, float], texture: int) -> Mesh:
     """An ellipsoid with its axes along x, y, z; u = 0.5 faces +x, v runs from the top down. radii:
     m.
     """
     polar = np.radians([2, 25, 50, 70, 90, 110, 130, 155, 178])
-    centres = np.zeros((len(polar), 3), dtype=np.float32)
-    centres[:, 2] = radii[2] * np.cos(polar)
+    centers = np.zeros((len(polar), 3), dtype=np.float32)
+    centers[:, 2] = radii[2] * np.cos(polar)
     rings = np.stack([radii[1] * np.sin(polar), radii[0] * np.sin(polar)], 1).astype(np.float32)
-    centres += np.asarray(centre, dtype=np.float32)
-    return tube(centres, rings, (0.0, -1.0, 0.0), texture, segments=14)
+    centers += np.asarray(center, dtype=np.float32)
+    return tube(centers, rings, (0.0, -1.0, 0.0), texture, segments=14)

@@ -42,7 +42,7 @@ class Room:
         return bool(np.all(near.max(axis=1) > radius)) if len(near) else True
 
 
-class _Builder:
+class _RoomBuilder:
     """Collects solids, textures and footprints of one room."""
 
     def __init__(
@@ -58,12 +58,12 @@ class _Builder:
         self.textures.append(image)
         return len(self.textures) - 1
 
-    def face(self) -> int:
+    def add_material(self) -> int:
         """A new texture for a piece of furniture."""
         maker = textures.FACES[int(self.rng.integers(len(textures.FACES)))]
         return self.add_texture(maker(self.rng, self.detail // 4, self.detail // 4))
 
-    def shell(self, plain: bool = False) -> None:
+    def add_shell(self, plain: bool = False) -> None:
         """Floor, ceiling and four walls, each with a texture of its own, darker towards the
         corners.
 
@@ -74,8 +74,11 @@ class _Builder:
         floor = textures.FLOORS[int(rng.integers(len(textures.FLOORS)))]
         walls = [textures.WALLS[int(k)] for k in rng.permutation(len(textures.WALLS))[:4]]
         walls = [textures.paint] * 4 if plain else walls
-        low, high = _cornered(floor(rng, d, d)), _cornered(textures.plaster(rng, d // 2, d // 2))
-        sides = [self.add_texture(_cornered(maker(rng, d // 2, d))) for maker in walls]
+        low, high = (
+            _darken_border(floor(rng, d, d)),
+            _darken_border(textures.plaster(rng, d // 2, d // 2)),
+        )
+        sides = [self.add_texture(_darken_border(maker(rng, d // 2, d))) for maker in walls]
         self.floor = self.add_texture(low)
         self.parts += [
             solids.quad((-w / 2, length, 0), (w, 0, 0), (0, -length, 0), self.floor),
@@ -86,7 +89,7 @@ class _Builder:
             solids.quad((w / 2, length, h), (0, -length, 0), (0, 0, -h), sides[3]),
         ]
 
-    def pictures(self, walls: int = 3) -> None:
+    def add_posters(self, walls: int = 3) -> None:
         """Posters on the far wall, on both side walls and, of four `walls`, on the near one."""
         w, length, h = self.size
         for wall in range(walls):
@@ -97,7 +100,7 @@ class _Builder:
                 wide, tall = self.rng.uniform(0.4, 0.8), self.rng.uniform(0.4, 0.9)
                 z = self.rng.uniform(1.2, max(h - tall / 2 - 0.25, 1.25)) + tall / 2
                 side = self.detail // 2 if wall in (0, 3) else self.detail // 4
-                look = self.add_texture(textures.poster(self.rng, side, side))
+                look = self.add_texture(textures.poster_texture(self.rng, side, side))
                 left = x - wide / 2 + self.rng.uniform(-0.15, 0.15)
                 if wall == 0:
                     part = solids.quad(
@@ -115,18 +118,18 @@ class _Builder:
                     )
                 self.parts.append(part)
 
-    def shelf(self, x: float, y: float, yaw: float) -> None:
+    def add_shelf(self, x: float, y: float, yaw: float) -> None:
         """A bookcase."""
         size = (self.rng.uniform(0.7, 1.1), 0.32, self.rng.uniform(1.0, 2.0))
         look = self.add_texture(textures.books(self.rng, self.detail // 2, self.detail // 2))
-        self.parts.append(solids.box((x, y, size[2] / 2), size, yaw, look, self.face()))
-        self.stand(x, y, size, yaw)
+        self.parts.append(solids.box((x, y, size[2] / 2), size, yaw, look, self.add_material()))
+        self.add_footprint(x, y, size, yaw)
 
-    def table(self, x: float, y: float, yaw: float) -> None:
+    def add_table(self, x: float, y: float, yaw: float) -> None:
         """A table with a monitor, boxes and cans on it."""
         rng = self.rng
         size = (rng.uniform(1.0, 1.6), rng.uniform(0.6, 0.8), rng.uniform(0.68, 0.78))
-        look = self.face()
+        look = self.add_material()
         turn = solids.yaw_rotation(yaw)
         parts = [solids.box((0, 0, size[2]), (size[0], size[1], 0.04), 0, look, look)]
         for sx in (-1, 1):
@@ -150,18 +153,18 @@ class _Builder:
                 rng.uniform(-0.4, 0.4) * size[1],
                 size[2] + 0.02 + thing[2] / 2,
             )
-            parts.append(self.thing(place, thing))
-        self.parts.append(solids.join(parts).moved(turn, (x, y, 0.0)))
-        self.stand(x, y, size, yaw)
+            parts.append(self.small_object(place, thing))
+        self.parts.append(solids.join(parts).transformed(turn, (x, y, 0.0)))
+        self.add_footprint(x, y, size, yaw)
 
-    def thing(self, place: tuple[float, float, float], size: FloatArray) -> Mesh:
+    def small_object(self, place: tuple[float, float, float], size: FloatArray) -> Mesh:
         """A small box or can."""
         if self.rng.random() < 0.6:
-            look = self.face()
+            look = self.add_material()
             return solids.box(place, size, self.rng.uniform(0, 3), look, look)
         return self.cylinder(place, size[0] / 2, size[2])
 
-    def cylinder(self, centre: tuple[float, float, float], radius: float, height: float) -> Mesh:
+    def cylinder(self, center: tuple[float, float, float], radius: float, height: float) -> Mesh:
         """An upright cylinder with a lid."""
         z = np.array([0.5, 0.5, 0.4, -0.5], dtype=np.float32) * height
         r = np.array([0.02, 1.0, 1.0, 1.0], dtype=np.float32) * radius
@@ -169,19 +172,27 @@ class _Builder:
         rings[:, 2] = z
         turn: tuple[float, float, float] = (0.0, 1.0, 0.0)
         return solids.tube(
-            rings + np.array(centre, dtype=np.float32), np.stack([r, r], 1), turn, self.face(), 20
+            rings + np.array(center, dtype=np.float32),
+            np.stack([r, r], 1),
+            turn,
+            self.add_material(),
+            20,
         )
 
     def carton(self, x: float, y: float, yaw: float) -> None:
         """A crate, cupboard or barrel on the floor."""
         size = self.rng.uniform((0.35, 0.35, 0.3), (0.8, 0.6, 1.1))
         if self.rng.random() < 0.7:
-            self.parts.append(solids.box((x, y, size[2] / 2), size, yaw, self.face(), self.face()))
+            self.parts.append(
+                solids.box((x, y, size[2] / 2), size, yaw, self.add_material(), self.add_material())
+            )
         else:
             self.parts.append(self.cylinder((x, y, size[2] / 2), size[0] / 2, size[2]))
-        self.stand(x, y, (size[0], size[1], size[2]), yaw)
+        self.add_footprint(x, y, (size[0], size[1], size[2]), yaw)
 
-    def stand(self, x: float, y: float, size: tuple[float, float, float], yaw: float) -> None:
+    def add_footprint(
+        self, x: float, y: float, size: tuple[float, float, float], yaw: float
+    ) -> None:
         """Note the floor a piece of furniture takes."""
         c, s = abs(np.cos(yaw)), abs(np.sin(yaw))
         half = ((c * size[0] + s * size[1]) / 2, (s * size[0] + c * size[1]) / 2)
@@ -199,15 +210,15 @@ class _Builder:
             lamps.astype(np.float32), power.astype(np.float32), ambient.astype(np.float32)
         )
 
-    def line_sides(self, first: float) -> None:
+    def add_side_furniture(self, first: float) -> None:
         """Furniture along both side walls from y = `first` m on."""
         w, length, _ = self.size
         for side in (-1, 1):
             for y in np.arange(first, length - 0.9, 1.2):
-                kind = (self.shelf, self.carton)[int(self.rng.integers(2))]
+                kind = (self.add_shelf, self.carton)[int(self.rng.integers(2))]
                 kind(side * (w / 2 - 0.35), float(y), np.pi / 2)
 
-    def room(self) -> Room:
+    def build(self) -> Room:
         """What has been built, with shadows under it and lamps above."""
         footprints = np.array(self.footprints, dtype=np.float32).reshape(-1, 4)
         _shade_floor(self.textures[self.floor], footprints, self.size)
@@ -216,7 +227,7 @@ class _Builder:
         )
 
 
-def _cornered(image: Texture) -> Texture:
+def _darken_border(image: Texture) -> Texture:
     """The texture darkened towards its border, as corners of a room are."""
     height, width = image.shape[:2]
     x = np.minimum(np.arange(width), np.arange(width)[::-1]) / width
@@ -245,52 +256,56 @@ def furnished_room(
     detail: side of the largest texture, px, a power of two of at least 128. Tables that would stand
     in 0..walk_depth are moved behind it.
     """
-    build = _Builder(rng, size, detail)
-    build.shell()
-    build.pictures()
+    build = _RoomBuilder(rng, size, detail)
+    build.add_shell()
+    build.add_posters()
     w, length, _ = size
     for x in np.arange(-w / 2 + 0.6, w / 2 - 0.5, 1.25):
-        kind = (build.shelf, build.table, build.carton, build.table)[int(rng.integers(4))]
+        kind = (build.add_shelf, build.add_table, build.carton, build.add_table)[
+            int(rng.integers(4))
+        ]
         kind(
             float(x + rng.uniform(-0.1, 0.1)), length - rng.uniform(0.35, 0.5), rng.normal(0, 0.04)
         )
     for x in np.arange(-w / 2 + 1.2, w / 2 - 1.0, 1.9):
         y = length - rng.uniform(1.4, 1.9)
         if y > walk_depth + 0.5 and rng.random() < 0.7:
-            (build.table, build.carton)[int(rng.integers(2))](float(x), y, rng.uniform(-0.5, 0.5))
-    build.line_sides(max(walk_depth - 0.4, 0.8))
-    return build.room()
+            (build.add_table, build.carton)[int(rng.integers(2))](
+                float(x), y, rng.uniform(-0.5, 0.5)
+            )
+    build.add_side_furniture(max(walk_depth - 0.4, 0.8))
+    return build.build()
 
 
-def round_room(
+def loop_room(
     rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024
 ) -> Room:
     """Draw a room with furniture and pictures along all four walls and a free middle; arguments as
     `furnished_room`.
     """
-    build = _Builder(rng, size, detail)
-    build.shell()
-    build.pictures(walls=4)
+    build = _RoomBuilder(rng, size, detail)
+    build.add_shell()
+    build.add_posters(walls=4)
     w, length, _ = size
     for y, yaw in ((length - 0.4, 0.0), (0.4, np.pi)):
         for x in np.arange(-w / 2 + 0.6, w / 2 - 0.5, 1.25):
-            kind = (build.shelf, build.table, build.carton)[int(rng.integers(3))]
+            kind = (build.add_shelf, build.add_table, build.carton)[int(rng.integers(3))]
             kind(float(x + rng.uniform(-0.1, 0.1)), y, yaw + rng.normal(0, 0.04))
-    build.line_sides(1.3)
-    return build.room()
+    build.add_side_furniture(1.3)
+    return build.build()
 
 
 def plain_room(
     rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024
 ) -> Room:
     """Draw a room of plain walls with little before them; arguments as `furnished_room`."""
-    build = _Builder(rng, size, detail)
-    build.shell(plain=True)
+    build = _RoomBuilder(rng, size, detail)
+    build.add_shell(plain=True)
     w, length, _ = size
     for x in (-w / 2 + rng.uniform(0.9, 1.6), w / 2 - rng.uniform(0.9, 1.6)):
-        kind = (build.table, build.carton)[int(rng.integers(2))]
+        kind = (build.add_table, build.carton)[int(rng.integers(2))]
         kind(float(x), length - 0.5, rng.normal(0, 0.04))
-    return build.room()
+    return build.build()
 
 
 def _shade_floor(

@@ -11,7 +11,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.synth import furniture
 from cohdc_train.synth import people as bodies
 from cohdc_train.synth import walk_paths as walks
-from cohdc_train.synth.actors import Actor, Sitter, Thing, Walker
+from cohdc_train.synth.actors import Actor, MovableObject, SeatedPerson, Walker
 from cohdc_train.synth.camera_motion import (
     CameraMotion,
     camera_path,
@@ -20,8 +20,8 @@ from cohdc_train.synth.camera_motion import (
 )
 from cohdc_train.synth.mesh import join
 from cohdc_train.synth.random_streams import stream
-from cohdc_train.synth.renderer import Atlas, Camera, View, render
-from cohdc_train.synth.room import Room, furnished_room, plain_room, round_room, texture_detail
+from cohdc_train.synth.renderer import Atlas, RenderCamera, RenderedView, render
+from cohdc_train.synth.room import Room, furnished_room, loop_room, plain_room, texture_detail
 from cohdc_train.synth.walk_paths import Walk
 from cohdc_train.types import FloatArray
 
@@ -33,14 +33,14 @@ CROWD, CROWD_SHARE = 6, (0.36, 0.52)  # more people than this are a crowd, which
 PEAK = 0.62  # share that no frame should exceed
 EMPTY = 0.2  # share of the frames that may show next to nobody
 _COARSE_BIAS = 0.87  # exact over coarse share: pixels touched by a point count as whole ones
-_DRAWS = 24  # how often the ways are drawn anew to get there
+_MAX_DRAWS = 24  # how often the ways are drawn anew to get there
 # m beyond the view's border where people turn
-_REACH = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}
+_TURN_MARGIN = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}
 _EYE_Y = 0.9  # m from the wall behind the camera
 
 
 @dataclass(frozen=True)
-class Setting:
+class SceneConfig:
     """What happens in the room.
 
     Args:
@@ -66,14 +66,14 @@ class Setting:
                 )
         if self.cart == "pushed" and people < 1:
             raise DataError("scene.cart: pushed, but there are 0 people to push it")
-        if motion == "loop" and self != Setting():
+        if motion == "loop" and self != SceneConfig():
             raise DataError(
                 "motion: a loop goes with people who walk in a textured room, without a cart"
             )
 
 
 @dataclass(frozen=True)
-class Scene:
+class RenderedScene:
     """Everything a sequence shows, as functions of the frame number.
 
     truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own; metered:
@@ -82,14 +82,14 @@ class Scene:
 
     room: Room
     actors: tuple[Actor, ...]
-    camera: Camera
-    truth: FloatArray
+    camera: RenderCamera
+    groundtruth: FloatArray
     metered: tuple[int, ...] = (0,)
 
     @property
     def poses(self) -> FloatArray:
         """[n, 4, 4] T_wc of the frames, m."""
-        return self.truth[::TRUTH_PER_FRAME]
+        return self.groundtruth[::TRUTH_PER_FRAME]
 
     def atlas(self) -> Atlas:
         """The textures of room and actors."""
@@ -97,7 +97,7 @@ class Scene:
             [*self.room.textures, *(look for actor in self.actors for look in actor.textures)]
         )
 
-    def view(self, frame: int, atlas: Atlas) -> View:
+    def view(self, frame: int, atlas: Atlas) -> RenderedView:
         """The frame as a perfect camera sees it, the actors as instances 1.. in their order."""
         meshes, first = [self.room.mesh], len(self.room.textures)
         for k, actor in enumerate(self.actors):
@@ -107,7 +107,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class _Stage:
+class _ActorFactory:
     """What ways are drawn from. times [n] s and poses [n, 4, 4] T_wc of the frames."""
 
     rng: np.random.Generator
@@ -119,23 +119,28 @@ class _Stage:
         """People who cross the view; in a loop they lead the camera round."""
         if not people:
             return []
-        ways = walks.crowd(self.rng, self.times, distances, _REACH[self.motion])
+        ways = walks.crowd(self.rng, self.times, distances, _TURN_MARGIN[self.motion])
         if self.motion == "loop":
-            ways = walks.led_round(ways, self.times, self.poses[:, :2, 3], loop_heading(self.times))
+            ways = walks.follow_camera(
+                ways, self.times, self.poses[:, :2, 3], loop_heading(self.times)
+            )
         else:
-            ways = tuple(way.moved(0.0, _EYE_Y) for way in ways)
+            ways = tuple(way.transformed(0.0, _EYE_Y) for way in ways)
         return [Walker(person, way) for person, way in zip(people, ways, strict=True)]
 
     def stopping(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """People who stop and go."""
         ways = walks.stop_and_go(self.rng, self.times, distances)
         return [
-            Walker(person, way.moved(0.0, _EYE_Y)) for person, way in zip(people, ways, strict=True)
+            Walker(person, way.transformed(0.0, _EYE_Y))
+            for person, way in zip(people, ways, strict=True)
         ]
 
     def filling(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """One before the camera, the others cross behind."""
-        first = [Walker(person, walks.approach(self.times, self.poses)) for person in people[:1]]
+        first = [
+            Walker(person, walks.approach_camera(self.times, self.poses)) for person in people[:1]
+        ]
         return [*first, *self.crowd(people[1:], distances[1:] + 0.6)]
 
     def seated(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
@@ -151,21 +156,21 @@ class _Stage:
             heading = float(np.arctan2(-1.0, -side) + self.rng.uniform(-0.7, 0.7))
             fidget = sway(self.rng, self.times, 1.0, 3.0)
             gesture = np.clip(4 * sway(self.rng, self.times, 1.0, 6.0) - 3, 0, 1)
-            sitters.append(Sitter(person, place, heading, fidget, gesture))
+            sitters.append(SeatedPerson(person, place, heading, fidget, gesture))
             chair = furniture.chair(bodies.seat_height(person, bodies.sitting(0.0, 0.0)))
             rest = Walk(np.tile(place, (len(still), 1)), still + heading, still, still)
-            chairs.append(Thing(chair, (furniture.chair_texture(self.rng),), rest))
+            chairs.append(MovableObject(chair, (furniture.chair_texture(self.rng),), rest))
         return [*sitters, *chairs]
 
     def rolling(self, pusher: list[bodies.Person], distance: float) -> list[Actor]:
         """A cart, and who pushes it."""
         body, looks = furniture.cart(self.rng)
-        line = walks.errands(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
-        way, behind = walks.rolled(self.rng, self.times, line, furniture.HANDLE - 0.5)
-        ways = [walk.moved(0.0, distance + _EYE_Y) for walk in (way, behind)]
+        line = walks.back_and_forth(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
+        way, behind = walks.cart_path(self.rng, self.times, line, furniture.HANDLE - 0.5)
+        ways = [walk.transformed(0.0, distance + _EYE_Y) for walk in (way, behind)]
         return [
             *(Walker(person, ways[1], pushes=True) for person in pusher),
-            Thing(body, looks, ways[0]),
+            MovableObject(body, looks, ways[0]),
         ]
 
 
@@ -175,8 +180,8 @@ def draw_scene(
     size: tuple[int, int],
     motion: CameraMotion,
     people: int,
-    setting: Setting | None = None,
-) -> Scene:
+    setting: SceneConfig | None = None,
+) -> RenderedScene:
     """Draw the room, the camera's path and the ways, so that what moves covers 20-40 % of the
     pixels on average.
 
@@ -185,7 +190,7 @@ def draw_scene(
     crowd: CROWD_SHARE), PEAK and EMPTY; the best is taken. Whoever fills the view is left out of
     that.
     """
-    setting = setting or Setting()
+    setting = setting or SceneConfig()
     rng = stream(
         seed, "sequence", 1
     )  # apart from the room's, whose draws depend on the size of its textures
@@ -201,25 +206,33 @@ def draw_scene(
     middle = room.size[1] / 2 if motion == "loop" else _EYE_Y
     truth = camera_path(rng, fine, motion, np.array([0.0, middle, rng.uniform(1.25, 1.5)]))
     cast = [bodies.draw_person(rng, patterned=1.0) for _ in range(people)]
-    stage = _Stage(rng, fine[::TRUTH_PER_FRAME], truth[::TRUTH_PER_FRAME], motion)
+    factory = _ActorFactory(rng, fine[::TRUTH_PER_FRAME], truth[::TRUTH_PER_FRAME], motion)
     nobody = people == 0 and setting.cart == "none"
     metered = tuple(k * frames // 5 for k in range(5)) if motion == "loop" else (0,)
     fitted = not nobody and setting.action != "fill_view"
 
-    def draw(nearest: float) -> Scene:
-        return Scene(
-            room, _actors(stage, setting, cast, nearest), Camera.freiburg3(size), truth, metered
+    def draw(nearest: float) -> RenderedScene:
+        return RenderedScene(
+            room,
+            _actors(factory, setting, cast, nearest),
+            RenderCamera.freiburg3(size),
+            truth,
+            metered,
         )
 
-    return _fitted(draw, people) if fitted else draw(1.3)
+    return _best_scene(draw, people) if fitted else draw(1.3)
 
 
 def _room(
-    seed: int, size: tuple[float, float, float], detail: int, motion: CameraMotion, setting: Setting
+    seed: int,
+    size: tuple[float, float, float],
+    detail: int,
+    motion: CameraMotion,
+    setting: SceneConfig,
 ) -> Room:
     rng = stream(seed, "sequence")
     if motion == "loop":
-        return round_room(rng, size, detail)
+        return loop_room(rng, size, detail)
     return (
         plain_room(rng, size, detail)
         if setting.walls == "plain"
@@ -228,7 +241,7 @@ def _room(
 
 
 def _actors(
-    stage: _Stage, setting: Setting, cast: list[bodies.Person], nearest: float
+    factory: _ActorFactory, setting: SceneConfig, cast: list[bodies.Person], nearest: float
 ) -> tuple[Actor, ...]:
     """Everybody, the nearest `nearest` m from the eye: people first, things last."""
     pushers = 1 if setting.cart == "pushed" else 0
@@ -238,25 +251,25 @@ def _actors(
     )
     distances += 0.0 if setting.cart == "none" else 0.9
     act = {
-        "walk": stage.crowd,
-        "stop_and_go": stage.stopping,
-        "fill_view": stage.filling,
-        "sit": stage.seated,
+        "walk": factory.crowd,
+        "stop_and_go": factory.stopping,
+        "fill_view": factory.filling,
+        "sit": factory.seated,
     }
     actors = act[setting.action](others, distances)
     if setting.cart != "none":
-        actors += stage.rolling(cast[:pushers], nearest)
+        actors += factory.rolling(cast[:pushers], nearest)
     return tuple(sorted(actors, key=lambda actor: not actor.is_person))
 
 
-def _fitted(draw: Callable[[float], Scene], people: int) -> Scene:
+def _best_scene(draw: Callable[[float], RenderedScene], people: int) -> RenderedScene:
     """The best of some draws at distances that approach the wanted share."""
     wanted, peak_wanted = (CROWD_SHARE, 0.8) if people > CROWD else (SHARE, PEAK)
     nearest = 1.3
-    best: tuple[float, Scene] | None = None
-    for _ in range(_DRAWS):
+    best: tuple[float, RenderedScene] | None = None
+    for _ in range(_MAX_DRAWS):
         scene = draw(nearest)
-        shares = _coarse_shares(scene)
+        shares = _coarse_coverage(scene)
         mean, peak, empty = float(shares.mean()), float(shares.max()), float(np.mean(shares < 0.05))
         off = max(wanted[0] - mean, mean - wanted[1], 0.0)
         cost = off + 0.5 * max(peak - peak_wanted, 0.0) + 0.5 * max(empty - EMPTY, 0.0)
@@ -270,7 +283,7 @@ def _fitted(draw: Callable[[float], Scene], people: int) -> Scene:
     return best[1]
 
 
-def _coarse_shares(scene: Scene) -> FloatArray:
+def _coarse_coverage(scene: RenderedScene) -> FloatArray:
     """About the share of the pixels on actors in every sixth frame, from their points on 64 px."""
     camera = scene.camera.resized(64 / scene.camera.width)
     shares = []

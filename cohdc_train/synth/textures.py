@@ -6,7 +6,7 @@ import numpy as np
 from cohdc_train.types import Float32Array, Image
 
 Texture = Image  # [h, w, 3] RGB, h and w powers of two
-SATURATION = 0.35  # rooms are painted in calmer colours than people are dressed in
+SATURATION = 0.35  # rooms are painted in calmer colors than people are dressed in
 
 
 def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) -> Float32Array:
@@ -20,33 +20,33 @@ def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) 
     return total / max(float(total.std()), 1e-6)
 
 
-def colour(rng: np.random.Generator, low: float = 40, high: float = 225) -> Float32Array:
-    """[3] an RGB colour with components in low..high, from grey to strongly tinted."""
+def random_color(rng: np.random.Generator, low: float = 40, high: float = 225) -> Float32Array:
+    """[3] an RGB color with components in low..high, from gray to strongly tinted."""
     base = rng.uniform(low, high)
     mixed = base + rng.normal(0, 1, 3) * rng.uniform(4, 60)
     return np.clip(mixed, low, high).astype(np.float32)
 
 
-def finish(
+def add_dirt(
     image: Float32Array, rng: np.random.Generator, grain: float = 6.0, stains: float = 9.0
 ) -> Texture:
-    """Dirt and grain over a drawn surface in muted colours: float [h, w, 3] in 0..255 -> uint8."""
+    """Dirt and grain over a drawn surface in muted colors: float [h, w, 3] in 0..255 -> uint8."""
     height, width = image.shape[:2]
-    grey = image.mean(axis=2, keepdims=True)
-    image = grey + np.float32(SATURATION) * (image - grey)
+    gray = image.mean(axis=2, keepdims=True)
+    image = gray + np.float32(SATURATION) * (image - gray)
     dirt = cv2.resize(noise(rng, height // 2, width // 2), (width, height)) * np.float32(stains)
     dirt += rng.standard_normal((height, width), dtype=np.float32) * np.float32(grain)
     return np.clip(image + dirt[..., None], 0, 255).astype(np.uint8)
 
 
-def flat(height: int, width: int, rgb: Float32Array) -> Float32Array:
-    """[height, width, 3] float32 of one colour."""
+def solid(height: int, width: int, rgb: Float32Array) -> Float32Array:
+    """[height, width, 3] float32 of one color."""
     return np.tile(rgb.astype(np.float32), (height, width, 1))
 
 
 def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Painted wall with marks: short scratches, filled holes, stains."""
-    image = flat(height, width, colour(rng, 110, 225))
+    image = solid(height, width, random_color(rng, 110, 225))
     for _ in range(int(rng.integers(60, 130))):
         x, y = int(rng.integers(width)), int(rng.integers(height))
         shade = tuple(float(v) for v in np.clip(image[y, x] + rng.normal(0, 55), 0, 255))
@@ -57,20 +57,20 @@ def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
             cv2.circle(
                 image, (x, y), int(rng.integers(1, max(width // 90, 3))), shade, -1, cv2.LINE_AA
             )
-    return finish(image, rng, 7, 12)
+    return add_dirt(image, rng, 7, 12)
 
 
 def paint(rng: np.random.Generator, height: int, width: int) -> Texture:
-    """A freshly painted wall: one colour, next to no grain."""
-    return finish(flat(height, width, colour(rng, 150, 225)), rng, 0.8, 0.0)
+    """A freshly painted wall: one color, next to no grain."""
+    return add_dirt(solid(height, width, random_color(rng, 150, 225)), rng, 0.8, 0.0)
 
 
 def brick(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Bricks in mortar, every brick with a shade of its own."""
     rows = int(rng.integers(14, 24))
     columns = int(rng.integers(9, 16))
-    image = flat(height, width, colour(rng, 120, 210))
-    base = colour(rng, 60, 190)
+    image = solid(height, width, random_color(rng, 120, 210))
+    base = random_color(rng, 60, 190)
     gap = max(width // 250, 1)
     for r in range(rows):
         top, bottom = r * height // rows + gap, (r + 1) * height // rows - gap
@@ -79,23 +79,23 @@ def brick(rng: np.random.Generator, height: int, width: int) -> Texture:
             right = int((c + 1 + 0.5 * (r % 2)) * width / columns) - gap
             shade = np.clip(base + rng.normal(0, 16) + rng.normal(0, 6, 3), 0, 255)
             image[max(top, 0) : bottom, max(left, 0) : max(right, 0)] = shade
-    return finish(image, rng, 10, 10)
+    return add_dirt(image, rng, 10, 10)
 
 
 def tiles(rng: np.random.Generator, height: int, width: int) -> Texture:
-    """A checker of two colours whose tiles differ slightly, with joints."""
+    """A checker of two colors whose tiles differ slightly, with joints."""
     count = int(rng.integers(5, 13))
-    pair = np.stack([colour(rng, 40, 225), colour(rng, 40, 225)])
+    pair = np.stack([random_color(rng, 40, 225), random_color(rng, 40, 225)])
     row = np.arange(height) * count // height
     column = np.arange(width) * count // width
     shade = rng.normal(0, 12, (count, count)).astype(np.float32)
     image = pair[(row[:, None] + column[None]) % 2] + shade[row[:, None], column[None]][..., None]
     joint = (np.diff(row, prepend=-1) > 0)[:, None] | (np.diff(column, prepend=-1) > 0)[None]
-    image[joint] = colour(rng, 30, 120)
-    return finish(image.astype(np.float32), rng, 7, 12)
+    image[joint] = random_color(rng, 30, 120)
+    return add_dirt(image.astype(np.float32), rng, 7, 12)
 
 
-def wood(rng: np.random.Generator, height: int, width: int) -> Texture:
+def wood_texture(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Planks with grain along u, board ends and knots."""
     boards = int(rng.integers(3, 9))
     base = np.array(
@@ -120,12 +120,12 @@ def wood(rng: np.random.Generator, height: int, width: int) -> Texture:
             cv2.ellipse(
                 image, knot, axes, 0, 0, 360, tuple(float(v) for v in base * 0.5), -1, cv2.LINE_AA
             )
-    return finish(image, rng, 6, 6)
+    return add_dirt(image, rng, 6, 6)
 
 
 def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
-    """Stripes with a motif that changes its colour and size from place to place."""
-    ground, stripe = colour(rng, 90, 225), colour(rng, 60, 225)
+    """Stripes with a motif that changes its color and size from place to place."""
+    ground, stripe = random_color(rng, 90, 225), random_color(rng, 60, 225)
     period = int(rng.integers(width // 14, width // 6))
     image = np.where(
         ((np.arange(width) // max(period // 2, 1)) % 2 == 0)[None, :, None], ground, stripe
@@ -134,7 +134,7 @@ def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
     step = max(int(period * rng.uniform(0.6, 1.2)), 6)
     for y in range(step // 2, height, step):
         for x in range(step // 2, width, step):
-            ink = tuple(float(v) for v in colour(rng, 20, 235))
+            ink = tuple(float(v) for v in random_color(rng, 20, 235))
             radius = int(rng.integers(max(step // 8, 2), max(step // 3, 4)))
             sides = int(rng.integers(3, 8))
             angle = np.linspace(0, 2 * np.pi, sides, endpoint=False) + rng.uniform(0, 6)
@@ -142,12 +142,12 @@ def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
                 np.int32
             )
             cv2.fillPoly(image, [star], ink, cv2.LINE_AA)
-    return finish(image, rng, 5, 8)
+    return add_dirt(image, rng, 5, 8)
 
 
 def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Speckled carpet with a woven pattern of rectangles."""
-    image = flat(height, width, colour(rng, 50, 170))
+    image = solid(height, width, random_color(rng, 50, 170))
     for _ in range(int(rng.integers(25, 60))):
         x, y = int(rng.integers(width)), int(rng.integers(height))
         w, h = int(rng.integers(4, max(width // 8, 6))), int(rng.integers(4, max(height // 8, 6)))
@@ -155,75 +155,77 @@ def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
             image,
             (x, y),
             (x + w, y + h),
-            tuple(float(v) for v in colour(rng, 40, 190)),
+            tuple(float(v) for v in random_color(rng, 40, 190)),
             int(rng.choice([-1, 2, 3])),
         )
-    return finish(image, rng, 18, 10)
+    return add_dirt(image, rng, 18, 10)
 
 
-def poster(rng: np.random.Generator, height: int, width: int) -> Texture:
+def poster_texture(rng: np.random.Generator, height: int, width: int) -> Texture:
     """A picture of random shapes and lines of letters in a frame."""
-    image = flat(height, width, colour(rng, 30, 235))
+    image = solid(height, width, random_color(rng, 30, 235))
     for _ in range(int(rng.integers(8, 22))):
-        ink = tuple(float(v) for v in colour(rng, 10, 245))
+        ink = tuple(float(v) for v in random_color(rng, 10, 245))
         corners = rng.uniform(0, 1, (int(rng.integers(3, 6)), 2)) * rng.uniform(
             0.2, 0.7
         ) + rng.uniform(-0.1, 0.8, 2)
         cv2.fillPoly(image, [(corners * [width, height]).astype(np.int32)], ink, cv2.LINE_AA)
-        centre = (int(rng.integers(width)), int(rng.integers(height)))
+        center = (int(rng.integers(width)), int(rng.integers(height)))
         cv2.circle(
             image,
-            centre,
+            center,
             int(rng.integers(2, max(width // 7, 4))),
             ink[::-1],
             int(rng.choice([-1, 2])),
             cv2.LINE_AA,
         )
-    letters(image, rng, int(rng.integers(1, 6)))
+    write_letters(image, rng, int(rng.integers(1, 6)))
     edge = max(width // 32, 2)
     cv2.rectangle(
         image,
         (0, 0),
         (width - 1, height - 1),
-        tuple(float(v) for v in colour(rng, 10, 120)),
+        tuple(float(v) for v in random_color(rng, 10, 120)),
         2 * edge,
     )
-    return finish(image, rng, 5, 4)
+    return add_dirt(image, rng, 5, 4)
 
 
 def books(rng: np.random.Generator, height: int, width: int) -> Texture:
-    """Shelves filled with book spines of many heights and colours."""
+    """Shelves filled with book spines of many heights and colors."""
     shelves = int(rng.integers(3, 6))
-    image = flat(height, width, colour(rng, 30, 90))
+    image = solid(height, width, random_color(rng, 30, 90))
     for s in range(shelves):
         top, bottom = s * height // shelves, (s + 1) * height // shelves - max(height // 60, 2)
         x = 0
         while x < width:
             thick = int(rng.integers(max(width // 50, 3), max(width // 16, 6)))
             tall = int((bottom - top) * rng.uniform(0.55, 0.95))
-            image[bottom - tall : bottom, x : x + thick] = colour(rng, 20, 235)
+            image[bottom - tall : bottom, x : x + thick] = random_color(rng, 20, 235)
             band = bottom - int(tall * rng.uniform(0.3, 0.9))
-            image[band : band + max(tall // 9, 1), x + 1 : x + thick - 1] = colour(rng, 20, 245)
+            image[band : band + max(tall // 9, 1), x + 1 : x + thick - 1] = random_color(
+                rng, 20, 245
+            )
             x += thick + int(rng.integers(0, 3))
-        image[bottom : bottom + max(height // 60, 2)] = colour(rng, 80, 160)
-    return finish(image, rng, 5, 4)
+        image[bottom : bottom + max(height // 60, 2)] = random_color(rng, 80, 160)
+    return add_dirt(image, rng, 5, 4)
 
 
 def screen(rng: np.random.Generator, height: int, width: int) -> Texture:
     """A monitor: bezel, windows and text."""
-    image = flat(height, width, colour(rng, 20, 160))
+    image = solid(height, width, random_color(rng, 20, 160))
     for _ in range(int(rng.integers(2, 5))):
         x, y = int(rng.integers(0, width * 2 // 3)), int(rng.integers(0, height * 2 // 3))
-        ink = tuple(float(v) for v in colour(rng, 150, 250))
+        ink = tuple(float(v) for v in random_color(rng, 150, 250))
         cv2.rectangle(image, (x, y), (x + width // 3, y + height // 3), ink, -1)
-    letters(image, rng, 9)
+    write_letters(image, rng, 9)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), (25.0, 25.0, 28.0), max(width // 14, 3))
-    return finish(image, rng, 2, 1)
+    return add_dirt(image, rng, 2, 1)
 
 
-def carton(rng: np.random.Generator, height: int, width: int) -> Texture:
+def carton_texture(rng: np.random.Generator, height: int, width: int) -> Texture:
     """A painted or cardboard face with tape, labels and print."""
-    image = flat(height, width, colour(rng, 60, 215))
+    image = solid(height, width, random_color(rng, 60, 215))
     image[:, width // 2 - width // 20 : width // 2 + width // 20] *= 0.8
     for _ in range(int(rng.integers(2, 6))):
         x, y = int(rng.integers(0, width * 3 // 4)), int(rng.integers(0, height * 3 // 4))
@@ -231,19 +233,25 @@ def carton(rng: np.random.Generator, height: int, width: int) -> Texture:
             x + int(rng.integers(width // 10, width // 3)),
             y + int(rng.integers(height // 10, height // 3)),
         )
-        cv2.rectangle(image, (x, y), end, tuple(float(v) for v in colour(rng, 20, 245)), -1)
-    letters(image, rng, 4)
-    return finish(image, rng, 7, 9)
+        cv2.rectangle(image, (x, y), end, tuple(float(v) for v in random_color(rng, 20, 245)), -1)
+    write_letters(image, rng, 4)
+    return add_dirt(image, rng, 7, 9)
 
 
-def letters(image: Float32Array, rng: np.random.Generator, lines: int) -> None:
+def write_letters(image: Float32Array, rng: np.random.Generator, lines: int) -> None:
     """Write lines of random letters over a float [h, w, 3] image, in place."""
     height, width = image.shape[:2]
     alphabet = list("ABCDEFGHKLMNPRSTUVXYZ0123456789abdefghknprt#%&")
     for _ in range(lines):
         text = "".join(rng.choice(alphabet, int(rng.integers(4, 14))))
         place = (int(rng.integers(0, width * 2 // 3)), int(rng.integers(height // 8, height)))
-        write(image, text, place, float(rng.uniform(0.25, 1.1) * width / 256), colour(rng, 5, 250))
+        write(
+            image,
+            text,
+            place,
+            float(rng.uniform(0.25, 1.1) * width / 256),
+            random_color(rng, 5, 250),
+        )
 
 
 def write(
@@ -259,6 +267,6 @@ def write(
     rows[:] = rows * (1 - cover) + ink * cover
 
 
-WALLS = (plaster, brick, tiles, wallpaper, wood)
-FLOORS = (wood, tiles, carpet)
-FACES = (wood, carton, plaster, carton)
+WALLS = (plaster, brick, tiles, wallpaper, wood_texture)
+FLOORS = (wood_texture, tiles, carpet)
+FACES = (wood_texture, carton_texture, plaster, carton_texture)

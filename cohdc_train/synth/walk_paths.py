@@ -19,15 +19,15 @@ _NEAR = 0.55  # m from the camera to the axis of a body that fills its view
 class Walk:
     """One person's way.
 
-    position: [n, 2] m; heading: [n] rad; travelled: [n] m; pace: [n] 0 = stands, 1 = walks.
+    position: [n, 2] m; heading: [n] rad; traveled: [n] m; pace: [n] 0 = stands, 1 = walks.
     """
 
     position: FloatArray
     heading: FloatArray
-    travelled: FloatArray
+    distance_walked: FloatArray
     pace: FloatArray
 
-    def moved(self, x: float, y: float) -> "Walk":
+    def transformed(self, x: float, y: float) -> "Walk":
         """The same way, `x` and `y` m further."""
         return replace(self, position=self.position + np.array([x, y]))
 
@@ -84,7 +84,7 @@ def walk_along(
 ) -> Walk:
     """A person who walks where `position` [n, 2] m leads, looking ahead.
 
-    start: m travelled before; jumps: frames at which the person is put elsewhere and goes on as
+    start: m traveled before; jumps: frames at which the person is put elsewhere and goes on as
     before.
     """
     velocity = np.diff(position, axis=0, prepend=position[:1])
@@ -119,7 +119,7 @@ def _smooth(line: FloatArray, frames: float) -> FloatArray:
     return smooth
 
 
-def led_round(
+def follow_camera(
     walks: tuple[Walk, ...], times: FloatArray, eyes: FloatArray, headings: FloatArray
 ) -> tuple[Walk, ...]:
     """The walks of a crowd bent into arcs about `eyes` [n, 2] m, and turned with a camera that
@@ -134,11 +134,11 @@ def led_round(
         distance = walk.position[:, 1]
         angle = headings + walk.position[:, 0] / distance
         position = eyes + distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], 1)
-        bent.append(walk_along(times, position, float(walk.travelled[0])))
+        bent.append(walk_along(times, position, float(walk.distance_walked[0])))
     return tuple(bent)
 
 
-def errands(
+def back_and_forth(
     rng: np.random.Generator,
     times: FloatArray,
     reach: float,
@@ -151,12 +151,12 @@ def errands(
     It begins at rest; pauses last `pause` (least, most) s; pace: m/s. Every way leads to the other
     side of 0.
     """
-    knots = list(_stops(rng, float(times[-1]), reach, pause, pace))
+    knots = list(_waypoints(rng, float(times[-1]), reach, pause, pace))
     line = np.interp(times, [t for t, _ in knots], [x for _, x in knots])
     return _smooth(line, _SMOOTH / float(times[1] - times[0]))
 
 
-def _stops(
+def _waypoints(
     rng: np.random.Generator, until: float, reach: float, pause: tuple[float, float], pace: float
 ) -> Iterator[tuple[float, float]]:
     """(s, m) at which the pace changes, the first at 0 s, the last after `until`."""
@@ -170,7 +170,7 @@ def _stops(
     yield t, x
 
 
-def rolled(
+def cart_path(
     rng: np.random.Generator, times: FloatArray, line: FloatArray, behind: float
 ) -> tuple[Walk, Walk]:
     """The ways of a cart that goes forwards and backwards along `line` [n] m, aslant, and of who
@@ -201,15 +201,17 @@ def stop_and_go(
     """
     walks = []
     for distance in distances:
-        line = errands(rng, times, 0.42 * float(distance), (1.5, 2.5), float(rng.uniform(0.6, 0.8)))
+        line = back_and_forth(
+            rng, times, 0.42 * float(distance), (1.5, 2.5), float(rng.uniform(0.6, 0.8))
+        )
         walk = walk_along(
             times, np.stack([line, np.full_like(line, distance)], 1), float(rng.uniform(0, 1.4))
         )
-        walks.append(replace(walk, heading=_turning(times, line)))
+        walks.append(replace(walk, heading=_turn_headings(times, line)))
     return tuple(walks)
 
 
-def _turning(times: FloatArray, line: FloatArray) -> FloatArray:
+def _turn_headings(times: FloatArray, line: FloatArray) -> FloatArray:
     """[n] rad: 0 while `line` [n] m rises, pi while it falls; the turn between is over when the way
     begins.
     """
@@ -222,7 +224,7 @@ def _turning(times: FloatArray, line: FloatArray) -> FloatArray:
     return _smooth(np.where(ways[moving[np.maximum(latest, 0)]] > 0, 0.0, np.pi), 2 * lead)
 
 
-def approach(times: FloatArray, poses: FloatArray) -> Walk:
+def approach_camera(times: FloatArray, poses: FloatArray) -> Walk:
     """A person who comes up to the camera, stands before it for 3 tenths of the time, wherever it
     moves, and goes.
 

@@ -240,7 +240,7 @@ def test_subsets_are_the_same_every_time_and_nested(tmp_path: Path) -> None:
 
 def test_images_are_rgb_and_checked(tmp_path: Path) -> None:
     image = split_of(tmp_path).images[0]
-    assert tuple(read_image(image)[10, 10]) == toys.COLOURS[10]
+    assert tuple(read_image(image)[10, 10]) == toys.COLORS[10]
     wrong = split_of(tmp_path, lambda v: v["images"][0].update(height=64, width=48, id=1)).images[0]
     lost = r"48x64: swapped, or the file lost its EXIF orientation\?$"
     with pytest.raises(DataError, match=rf"image 1 is 64x48, its annotation {lost}"):

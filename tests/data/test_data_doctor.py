@@ -19,10 +19,10 @@ from torchvision.models.detection.image_list import ImageList
 from torchvision.ops import box_iou
 
 from cohdc_train.cli import main
-from cohdc_train.data.annotations import fills
+from cohdc_train.data.annotations import fills_image
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.data.doctor.anchor_recall import best_overlap
-from cohdc_train.data.doctor.issues import KINDS
+from cohdc_train.data.doctor.issues import ISSUE_KINDS
 from cohdc_train.data.layout import CocoPaths
 from cohdc_train.errors import DataError
 from cohdc_train.models import MaskRCNN, NetworkConfig
@@ -41,10 +41,10 @@ TINY = NetworkConfig(
 READABLE_ERRORS = {"leak", "box-corners"}
 
 
-def findings(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[str]]]]:
+def issues(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[str]]]]:
     """Exit code, and kind -> places of both splits."""
     code = main(["data", "doctor", str(root), "--out", str(root / "seen"), *options])
-    return code, json.loads((root / "seen" / "findings.json").read_text())
+    return code, json.loads((root / "seen" / "issues.json").read_text())
 
 
 # What training does with a warning of this kind is counted in the line that it logs.
@@ -67,7 +67,7 @@ def train_once(paths: dict[str, Any]) -> int:
     assert all(torch.isfinite(batch.images).all() for batch in batches)
     network = MaskRCNN(data.num_classes, TINY)
     for batch in batches:
-        total = sum(network.losses(batch.images, batch.targets).values())
+        total = sum(network.reading_report(batch.images, batch.targets).values())
         assert torch.isfinite(total)
         total.backward()
     gradients = [p.grad for p in network.parameters() if p.requires_grad]
@@ -79,7 +79,7 @@ def train_once(paths: dict[str, Any]) -> int:
 def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, found = findings(broken_folders.whole(tmp_path / "a"))
+    code, found = issues(broken_folders.whole(tmp_path / "a"))
     assert code == 0
     assert found == {"train": {"category-gap": ["10, 20"]}, "val": {"category-gap": ["10, 20"]}}
     printed = capsys.readouterr().out
@@ -91,7 +91,7 @@ def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(
 def test_the_corpus_is_large_and_shows_most_kinds() -> None:
     shown = {case.kind for case in broken_folders.BROKEN.values()}
     assert len(broken_folders.BROKEN) >= 50
-    assert set(KINDS) - shown == {
+    assert set(ISSUE_KINDS) - shown == {
         "category-gap",
         "category-unused",
         "class-only-val",
@@ -106,9 +106,9 @@ def test_it_is_found_training_agrees_and_the_mend_holds(
     case = broken_folders.BROKEN[name]
     root = broken_folders.build(tmp_path / "a", name)
     before = (root / "instances_train.json").read_bytes()
-    code, found = findings(root, "--fix", str(tmp_path / "mended"))
+    code, found = issues(root, "--fix", str(tmp_path / "mended"))
     assert case.kind in found["train"]
-    errors = {kind for kind in found["train"] if KINDS[kind].severity == "error"}
+    errors = {kind for kind in found["train"] if ISSUE_KINDS[kind].severity == "error"}
     assert code == (1 if errors else 0)
     told = capsys.readouterr()
     assert f"[{case.kind}]" in told.out
@@ -122,9 +122,11 @@ def test_it_is_found_training_agrees_and_the_mend_holds(
         assert str(root) in str(caught.value)
     else:
         if case.kind in COUNTED:
-            assert re.search(COUNTED[case.kind], CocoDataModule(root).folder.train[0].losses())
+            assert re.search(
+                COUNTED[case.kind], CocoDataModule(root).folder.train[0].reading_report()
+            )
         assert train_once({"root": root}) > 5
-    if case.mended:
+    if case.fixed:
         check_mended(tmp_path / "mended", root)
 
 
@@ -137,7 +139,7 @@ def check_mended(folder: Path, root: Path) -> None:
     paths = CocoPaths(files["train"], images, files["val"], images)
     assert train_once({"paths": paths}) > 5
     data = CocoDataModule(paths=paths)
-    assert data.folder.train[0].losses() == ""
+    assert data.folder.train[0].reading_report() == ""
     removed = json.loads((folder / "removed.json").read_text())
     for name, file in files.items():
         given, kept = json.loads((root / file.name).read_text()), json.loads(file.read_text())
@@ -153,12 +155,15 @@ def check_mended(folder: Path, root: Path) -> None:
     (linked / "images").symlink_to(images)
     for file in files.values():
         (linked / file.name).write_bytes(file.read_bytes())
-    code, found = findings(linked)
+    code, found = issues(linked)
     assert code == 0
     still = {
-        kind for split in found.values() for kind in split if KINDS[kind].severity == "warning"
+        kind
+        for split in found.values()
+        for kind in split
+        if ISSUE_KINDS[kind].severity == "warning"
     }
-    assert still <= {"image-colour", "category-unused", "class-only-val"}
+    assert still <= {"image-color", "category-unused", "class-only-val"}
 
 
 def test_the_mend_never_overwrites_what_it_reads(
@@ -172,7 +177,7 @@ def test_the_mend_never_overwrites_what_it_reads(
 
 
 @pytest.mark.parametrize("option", ["--fix", "--out"])
-@pytest.mark.parametrize("name", ["instances_val.json", "findings.json"])
+@pytest.mark.parametrize("name", ["instances_val.json", "issues.json"])
 def test_doctor_keeps_files_it_did_not_write(
     tmp_path: Path, option: str, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -191,7 +196,7 @@ def test_a_class_that_only_validation_has_objects_of(tmp_path: Path) -> None:
     content = json.loads((root / "instances_train.json").read_text())
     content["annotations"] = [row for row in content["annotations"] if row["category_id"] == 10][1:]
     toys.write(root / "instances_train.json", content)
-    code, found = findings(root)
+    code, found = issues(root)
     assert code == 0
     assert found["val"]["class-only-val"] == ["car"]
     assert found["train"]["category-unused"] == ["car"]
@@ -207,10 +212,10 @@ def test_runs_are_read_as_pycocotools_writes_them(runs: list[int]) -> None:
     if pixels == 0:
         return
     encoded = rle.frPyObjects({"size": [pixels, 1], "counts": runs}, pixels, 1)["counts"]
-    assert fills(runs, pixels)
-    assert fills(encoded, pixels)
-    assert fills(encoded.decode(), pixels)
-    assert not fills(encoded.decode(), pixels + 1)
+    assert fills_image(runs, pixels)
+    assert fills_image(encoded, pixels)
+    assert fills_image(encoded.decode(), pixels)
+    assert not fills_image(encoded.decode(), pixels + 1)
 
 
 @settings(max_examples=40, deadline=None)

@@ -136,7 +136,7 @@ LABELME_ERRORS = {
     r"a\.json: shape 1: no label$": lambda p: toys.labelme_file(
         p, [toys.shape("", "polygon", toys.PERSON)]
     ),
-    r"a\.json: shape 1: circle needs its centre": lambda p: toys.labelme_file(
+    r"a\.json: shape 1: circle needs its center": lambda p: toys.labelme_file(
         p, [toys.shape("x", "circle", [1, 2])]
     ),
     r"a\.json: shape 2: rectangle needs two": lambda p: toys.labelme_file(

@@ -80,8 +80,8 @@ def test_no_test_image_is_converted_and_none_is_lost(format: Any, folders: dict[
             return
         found = stems(converted(format, root))
     own = kinds["train"] > 0 and kinds["val"] > 0
-    for name, numbers in found.items():
-        owned = {owners[number] for number in numbers}
+    for name, parse_numbers in found.items():
+        owned = {owners[number] for number in parse_numbers}
         assert owned == {name} if own else "test" not in owned
     expected = kinds["train"] + kinds["val"] if own else usable
     assert len(found["train"]) + len(found["val"]) == expected

@@ -1,4 +1,4 @@
-"""Pascal VOC segmentation: majorities, void, colours, names, and every mistake named."""
+"""Pascal VOC segmentation: majorities, void, colors, names, and every mistake named."""
 
 from pathlib import Path
 
@@ -40,8 +40,8 @@ LABELMAP = "# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:10,20,30::\
 
 
 @pytest.mark.parametrize("palette", [True, False])
-def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
-    """As CVAT writes it: no split, PNGs of colours, images of any type in sub folders."""
+def test_voc_colors_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
+    """As CVAT writes it: no split, PNGs of colors, images of any type in sub folders."""
     root = tmp_path / "source"
     objects, classes = toys.voc_labels()
     paints = {
@@ -56,8 +56,8 @@ def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
         toys.picture(root / "JPEGImages" / f"{name}.png", seed)
         for folder, values in (("SegmentationObject", objects), ("SegmentationClass", classes)):
             rgb = np.zeros((*values.shape, 3), np.uint8)
-            for value, colour in paints.items():
-                rgb[values == value] = colour
+            for value, color in paints.items():
+                rgb[values == value] = color
             image = Image.fromarray(rgb)
             path = root / folder / f"{name}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
         assert np.array_equal(found["car"], toys.box_mask(*toys.CAR))
         assert np.array_equal(found["person"], toys.box_mask(5, 4, 25, 30))
     toys.write(root / "labelmap.txt", LABELMAP.replace("200,10,0", "200,10,1"))
-    with pytest.raises(DataError, match=r"a\.png: colour 200,10,0 is no class's$"):
+    with pytest.raises(DataError, match=r"a\.png: color 200,10,0 is no class's$"):
         convert("voc", root, tmp_path / "out")
 
 
@@ -114,7 +114,7 @@ VOC_ERRORS = {
     r"labelmap\.txt:2: class 'a' is listed twice$": lambda r: toys.write(
         r / "labelmap.txt", "a:1,2,3::\na:4,5,6::\n"
     ),
-    r"labelmap\.txt:2: b has the colour of a$": lambda r: toys.write(
+    r"labelmap\.txt:2: b has the color of a$": lambda r: toys.write(
         r / "labelmap.txt", "a:1,2,3::\nb:1,2,3::\n"
     ),
     r"labelmap\.txt: 0 classes; 1 to 254": lambda r: toys.write(

@@ -84,15 +84,15 @@ def test_yolo_boxes_are_rectangles_and_said_aloud(
 @given(
     height=st.integers(20, 300),
     width=st.integers(20, 300),
-    centre=st.tuples(st.floats(0.3, 0.7), st.floats(0.3, 0.7)),
+    center=st.tuples(st.floats(0.3, 0.7), st.floats(0.3, 0.7)),
     radii=st.lists(st.floats(0.1, 0.29), min_size=3, max_size=30),
 )
 def test_yolo_polygons_come_back(
-    height: int, width: int, centre: tuple[float, float], radii: list[float]
+    height: int, width: int, center: tuple[float, float], radii: list[float]
 ) -> None:
     angles = np.arange(len(radii)) * 2 * np.pi / len(radii)
     star = np.stack(
-        [centre[0] + radii * np.cos(angles), centre[1] + radii * np.sin(angles)], axis=1
+        [center[0] + radii * np.cos(angles), center[1] + radii * np.sin(angles)], axis=1
     ).clip(0, 1)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "source"

@@ -110,7 +110,7 @@ def assert_labeled(pixels: NDArray[np.uint8], mask: NDArray[Any]) -> None:
 def doctor(root: Path, *options: str) -> tuple[int, dict[str, list[str]]]:
     """Exit code, and the training split's findings."""
     code = main(["data", "doctor", str(root), "--out", str(root / "seen"), *options])
-    return code, json.loads((root / "seen" / "findings.json").read_text())["train"]
+    return code, json.loads((root / "seen" / "issues.json").read_text())["train"]
 
 
 def test_labels_of_the_upright_image_lie_on_the_object(tmp_path: Path, capsys: Captured) -> None:

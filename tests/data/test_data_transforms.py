@@ -42,7 +42,7 @@ def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     torch.manual_seed(seed)
     pixels, whole = picture(height, width)
     placement = Placement.draw((height, width), (rows, columns), Augmentation(flip=float(flip)))
-    assert placement.mirrored == flip
+    assert placement.mirror_fingerprints == flip
     image, mask = placement.image(pixels), placement.mask(whole) > 0
     assert image.shape == (3, rows, columns)
     assert mask.shape == (rows, columns)
@@ -94,7 +94,7 @@ def test_the_jitter_covers_its_range() -> None:
     assert 0.5 <= min(scales) < 0.53
     assert 1.47 < max(scales) <= 1.51
     assert len({(p.top, p.left) for p in placements}) > 50
-    assert 100 < sum(p.mirrored for p in placements) < 200
+    assert 100 < sum(p.mirror_fingerprints for p in placements) < 200
 
 
 @pytest.mark.parametrize("jitter", [(0.0, 1.0), (1.5, 0.5)])

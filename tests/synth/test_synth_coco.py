@@ -12,7 +12,7 @@ import pytest
 
 from cohdc_train.errors import DataError
 from cohdc_train.synth import coco
-from cohdc_train.synth.coco import SMALLEST_SHARE, Picture, draw_stage, take_picture
+from cohdc_train.synth.coco import SMALLEST_SHARE, LabeledImage, draw_populated_room, render_image
 from cohdc_train.synth.coco_annotation import annotate
 from cohdc_train.synth.random_streams import stream
 
@@ -77,11 +77,11 @@ def test_annotations_are_the_rendered_masks(folder: Path) -> None:
     rng = stream(5, "coco-train", 0)
     from cohdc_train.synth.room import texture_detail
 
-    stage = draw_stage(rng, texture_detail(SIZE))
+    room_with_people = draw_populated_room(rng, texture_detail(SIZE))
     api = pycocotools.COCO(folder / "instances_train.json")
     seen = 0
     for image_id in (1, 2, 3, 4, 5):
-        picture: Picture = take_picture(stage, rng, SIZE)
+        picture: LabeledImage = render_image(room_with_people, rng, SIZE)
         annotations = api.loadAnns(sorted(api.getAnnIds(image_id)))
         assert len(annotations) == len(picture.masks)
         for annotation, mask in zip(annotations, picture.masks, strict=True):
@@ -112,7 +112,7 @@ def test_people_who_are_near_fill_more_of_the_picture(folder: Path, tmp_path: Pa
 
 def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
     keys = [("coco-train", 0), ("coco-train", 1), ("coco-val", 0), ("coco-val", 1), ("sequence", 0)]
-    stages = [draw_stage(stream(0, *key), 128) for key in keys]
+    stages = [draw_populated_room(stream(0, *key), 128) for key in keys]
     for i, a in enumerate(stages):
         for b in stages[:i]:
             assert a.room.size != b.room.size

@@ -69,10 +69,11 @@ def test_layout(folder: Path) -> None:
         listed = rows(folder / f"{kind}.txt")
         assert len(listed) == FRAMES
         assert all(
-            name == f"{kind}/{stamp}.png" and (folder / name).is_file() for stamp, name in listed
+            name == f"{kind}/{timestamp}.png" and (folder / name).is_file()
+            for timestamp, name in listed
         )
-        stamps = np.array([float(stamp) for stamp, _ in listed])
-        np.testing.assert_allclose(np.diff(stamps), 1 / 30, atol=2e-6)
+        timestamps = np.array([float(timestamp) for timestamp, _ in listed])
+        np.testing.assert_allclose(np.diff(timestamps), 1 / 30, atol=2e-6)
     assert listed[0][0] == "1305031102.175304"
     truth = (folder / "groundtruth.txt").read_text().splitlines()
     assert truth[0] == "# ground truth trajectory"
@@ -80,7 +81,9 @@ def test_layout(folder: Path) -> None:
     values = np.array(rows(folder / "groundtruth.txt"), dtype=float)
     assert values.shape == (3 * (FRAMES - 1) + 1, 8)
     np.testing.assert_allclose(np.linalg.norm(values[:, 4:], axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(values[::3, 0], [float(stamp) for stamp, _ in listed], atol=2e-6)
+    np.testing.assert_allclose(
+        values[::3, 0], [float(timestamp) for timestamp, _ in listed], atol=2e-6
+    )
 
 
 def test_camera_file(folder: Path) -> None:
@@ -115,17 +118,17 @@ def test_written_truth_carries_depth_from_frame_to_frame(folder: Path) -> None:
     camera = yaml.safe_load((folder / "camera.yaml").read_text())
     K = np.array([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     truth = np.array(rows(folder / "groundtruth.txt"), dtype=float)
-    stamps = [stamp for stamp, _ in rows(folder / "depth.txt")]
+    timestamps = [timestamp for timestamp, _ in rows(folder / "depth.txt")]
 
     def frame(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(truth[3 * k, 4:]).as_matrix()
         pose[:3, 3] = truth[3 * k, 1:4]
         depth = (
-            cv2.imread(str(folder / "depth" / f"{stamps[k]}.png"), cv2.IMREAD_UNCHANGED)
+            cv2.imread(str(folder / "depth" / f"{timestamps[k]}.png"), cv2.IMREAD_UNCHANGED)
             / camera["depth_scale"]
         )
-        return pose, depth, cv2.imread(str(folder / "masks" / f"{stamps[k]}.png"), 0) == 0
+        return pose, depth, cv2.imread(str(folder / "masks" / f"{timestamps[k]}.png"), 0) == 0
 
     (first_pose, first, first_static), (last_pose, last, last_static) = frame(0), frame(FRAMES - 1)
     v, u = np.nonzero(first_static & (first > 0))

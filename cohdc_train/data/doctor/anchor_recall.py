@@ -39,11 +39,11 @@ def best_overlap(boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, in
         for ratio in RATIOS:
             # torchvision rounds half an anchor's sides to whole px
             half = np.round(np.array([scale / np.sqrt(ratio), scale * np.sqrt(ratio)]) / 2)
-            centre = (
+            center = (
                 np.round((boxes[:, :2] + boxes[:, 2:]) / 2 / stride).clip(0, steps - 1) * stride
             )
             best = np.maximum(
-                best, _iou(boxes, np.concatenate([centre - half, centre + half], axis=1))
+                best, _iou(boxes, np.concatenate([center - half, center + half], axis=1))
             )
     return best
 

@@ -11,8 +11,8 @@ import yaml
 from cohdc_train.data.coco import CocoSplit, read_split
 from cohdc_train.data.doctor.anchor_recall import recall
 from cohdc_train.data.doctor.sample_grid import draw_grid
-from cohdc_train.data.doctor.split_checks import Inspection, inspect
-from cohdc_train.data.image_files import mirrored
+from cohdc_train.data.doctor.split_checks import SplitReport, check_split
+from cohdc_train.data.image_files import mirror_fingerprints
 from cohdc_train.data.layout import find_split
 from cohdc_train.errors import DataError
 from cohdc_train.files import claim_folder, write_json
@@ -20,7 +20,7 @@ from cohdc_train.presets import config_path
 
 _VERB = "data doctor"
 _SPLITS = ("train", "val")
-_SAME_PICTURE = 0.97  # product of two fingerprints; unrelated photographs reach .9
+_SAME_IMAGE = 0.97  # product of two fingerprints; unrelated photographs reach .9
 _SHOWN = 24  # counts of a split; `stats` prints all of them
 _TABLE3 = range(1, 11)
 
@@ -42,25 +42,25 @@ def doctor(
         root: the folder, in any of the usual layouts.
         fix: folder to write mended annotation files into, with `removed.json`: every row that is
             left out, and why.
-        out: folder to write `findings.json` and `annotations.jpg`, a grid of annotated images,
+        out: folder to write `issues.json` and `annotations.jpg`, a grid of annotated images,
             into.
         canvas: height and width, px, for the anchors' recall.
         anchor_scales: side of the anchors, px, one per pyramid level from stride 4.
     """
-    splits = [inspect(name, find_split(root, name)) for name in _SPLITS]
-    _compare(*splits)
+    splits = [check_split(name, find_split(root, name)) for name in _SPLITS]
+    _compare_splits(*splits)
     for split in splits:
         listed = f"{len(split.content['images'])} images, {len(split.content['annotations'])} annotations"
         print(
             f"{split.name}: {split.files.annotations}: {listed} can be used, {len(split.removed)} rows cannot"
         )
-        print("\n".join(split.findings.lines()) or "  nothing found")
+        print("\n".join(split.issues.lines()) or "  nothing found")
     if fix is not None:
-        _write_mended(splits, fix)
-    wrong = {split.name: split.findings.of("error") for split in splits}
+        _write_fixed(splits, fix)
+    wrong = {split.name: split.issues.of("error") for split in splits}
     if out is not None:
-        claim_folder(out, _VERB, ["findings.json", "annotations.jpg"])
-        write_json(out / "findings.json", {split.name: split.findings.places for split in splits})
+        claim_folder(out, _VERB, ["issues.json", "annotations.jpg"])
+        write_json(out / "issues.json", {split.name: split.issues.places for split in splits})
     count_of = sum(len(where) for kinds in wrong.values() for where in kinds.values())
     if count_of:
         kinds = ", ".join(sorted({kind for found in wrong.values() for kind in found}))
@@ -116,7 +116,7 @@ def summary(split: CocoSplit) -> str:
     return f"{split.name}: {'; '.join(shown[:_SHOWN])}" + ("; ..." if len(shown) > _SHOWN else "")
 
 
-def _compare(train: Inspection, val: Inspection) -> None:
+def _compare_splits(train: SplitReport, val: SplitReport) -> None:
     """Findings between the splits: classes, and images that are in both."""
     names = [
         {row["id"]: str(row["name"]) for row in split.content["categories"]}
@@ -124,25 +124,25 @@ def _compare(train: Inspection, val: Inspection) -> None:
     ]
     for here, there, split in ((names[0], names[1], train), (names[1], names[0], val)):
         for missing in sorted(set(here.values()) - set(there.values())):
-            split.findings.add("classes-differ", missing)
+            split.issues.add("classes-differ", missing)
     used = [
         {known.get(row["category_id"]) for row in split.content["annotations"]}
         for known, split in zip(names, (train, val), strict=True)
     ]
     for name in sorted(used[1] - used[0] & used[1], key=str):
-        val.findings.add("class-only-val", str(name))
-    if not train.prints or not val.prints:
+        val.issues.add("class-only-val", str(name))
+    if not train.fingerprints or not val.fingerprints:
         return
-    ours, theirs = (np.stack(list(split.prints.values())) for split in (train, val))
-    flipped = mirrored(theirs)
-    train_names, val_names = list(train.prints), list(val.prints)
+    ours, theirs = (np.stack(list(split.fingerprints.values())) for split in (train, val))
+    flipped = mirror_fingerprints(theirs)
+    train_names, val_names = list(train.fingerprints), list(val.fingerprints)
     for i, one in enumerate(ours):
         alike = np.maximum(theirs @ one, flipped @ one)
-        for j in np.nonzero(alike > _SAME_PICTURE)[0]:
-            train.findings.add("leak", f"{train_names[i]} = {val_names[j]}")
+        for j in np.nonzero(alike > _SAME_IMAGE)[0]:
+            train.issues.add("leak", f"{train_names[i]} = {val_names[j]}")
 
 
-def _write_mended(splits: Sequence[Inspection], folder: Path) -> None:
+def _write_fixed(splits: Sequence[SplitReport], folder: Path) -> None:
     """Write the mended files and say how to train on them."""
     paths = [folder / f"instances_{split.name}.json" for split in splits]
     for split, path in zip(splits, paths, strict=True):
@@ -164,7 +164,9 @@ def _print_statistics(
 ) -> None:
     for split in splits:
         print(summary(split))
-    print(f"Table 3 columns it has images enough for: {', '.join(_columns(splits)) or 'none'}")
+    print(
+        f"Table 3 columns it has images enough for: {', '.join(_table3_columns(splits)) or 'none'}"
+    )
     print(f"anchors {list(scales)} on a canvas of {canvas[0]}x{canvas[1]} px, objects of train:")
     boxes = _boxes(splits[0], canvas)
     for row in recall(boxes, scales, canvas):
@@ -184,7 +186,7 @@ def _boxes(split: CocoSplit, canvas: tuple[int, int]) -> Any:
     return np.array(rows).reshape(-1, 4)
 
 
-def _columns(splits: Sequence[CocoSplit]) -> list[str]:
+def _table3_columns(splits: Sequence[CocoSplit]) -> list[str]:
     """Names of the Table 3 configurations whose subsets the splits can give."""
     names = []
     for number in _TABLE3:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pycocotools import mask as rle
 
-from cohdc_train.data.image_files import PROBLEMS, look
+from cohdc_train.data.image_files import PROBLEMS, read_image_file
 from cohdc_train.errors import DataError
 from cohdc_train.images import IMAGE_SUFFIXES
 from cohdc_train.types import Mask
@@ -47,17 +47,17 @@ class SourceImage:
     path: Path
     width: int
     height: int
-    upright: bool = False
+    apply_exif: bool = False
     pixels: Callable[[], bytes] | None = None
     objects: tuple[SourceObject, ...] = ()
 
-    def holding(self, objects: Sequence[SourceObject]) -> "SourceImage":
+    def with_objects(self, objects: Sequence[SourceObject]) -> "SourceImage":
         """The same image with these objects."""
         return replace(self, objects=tuple(objects))
 
 
 @dataclass
-class Source:
+class SourceDataset:
     """Everything that was read.
 
     Attributes:
@@ -72,16 +72,16 @@ class Source:
     splits: dict[str, list[SourceImage]] = field(default_factory=dict)
     drawn_from: str = ""
     class_names: tuple[str, ...] | None = None
-    left_out: dict[str, list[str]] = field(default_factory=dict)
+    skipped: dict[str, list[str]] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
 
     def add(self, split: str, image: SourceImage) -> None:
         """Append an image to a split; "" where nothing tells its split."""
         self.splits.setdefault(split, []).append(image)
 
-    def leave_out(self, why: str, where: str) -> None:
+    def skip(self, why: str, where: str) -> None:
         """Count one thing that is not converted."""
-        self.left_out.setdefault(why, []).append(where)
+        self.skipped.setdefault(why, []).append(where)
 
     def note(self, what: str, where: str) -> None:
         """Count one thing worth knowing."""
@@ -95,7 +95,7 @@ def annotation_files(root: Path) -> list[Path]:
     """
     if root.is_file():
         return [root]
-    files = _below(root, {".json"})
+    files = _find_files(root, {".json"})
     if not files:
         raise DataError(
             f"{root}: {'no JSON file below it' if root.is_dir() else 'no such file or folder'}"
@@ -103,12 +103,12 @@ def annotation_files(root: Path) -> list[Path]:
     return files
 
 
-def leave_out_strays(root: Path, source: Source, why: str) -> None:
+def skip_unlisted(root: Path, source: SourceDataset, why: str) -> None:
     """Count the image files below a folder that no annotation file speaks of."""
     known = {image.path.resolve() for images in source.splits.values() for image in images}
-    for path in _below(root, IMAGE_SUFFIXES):
+    for path in _find_files(root, IMAGE_SUFFIXES):
         if path.resolve() not in known:
-            source.leave_out(why, str(path))
+            source.skip(why, str(path))
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
@@ -132,7 +132,7 @@ def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceIm
     annotated size is that of the stored pixels only.
     Raises DataError naming the file when it cannot be read or is of another size.
     """
-    file = look(path)
+    file = read_image_file(path)
     if file.problem:
         raise DataError(f"{path}: {PROBLEMS[file.problem]}")
     path = Path(os.path.abspath(path))
@@ -140,10 +140,10 @@ def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceIm
     if annotated not in (None, (width, height)):
         found = f"is {width}x{height}"
         raise DataError(f"{path}: {found}, its annotation {annotated[0]}x{annotated[1]}")
-    return SourceImage(path, width, height, upright=file.is_turned(annotated))
+    return SourceImage(path, width, height, apply_exif=file.is_turned(annotated))
 
 
-def numbers(values: Any, count: int | None = None) -> list[float]:
+def parse_numbers(values: Any, count: int | None = None) -> list[float]:
     """The values as finite floats. Raises TypeError or ValueError when they are not, or not `count`
     of them.
     """
@@ -162,7 +162,7 @@ def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[float]:
 
 
 def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> list[float]:
-    """A polygon [x, y, ...] from centre and half axes, px, turned by theta, rad, from x towards y.
+    """A polygon [x, y, ...] from center and half axes, px, turned by theta, rad, from x towards y.
 
     Raises ValueError when a half axis is not positive.
     """
@@ -177,12 +177,12 @@ def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> l
     return flat
 
 
-def encode(mask: Mask) -> dict[str, Any]:
+def encode_mask(mask: Mask) -> dict[str, Any]:
     """The compressed RLE of a mask [H, W]."""
     return dict(rle.encode(np.asfortranarray(mask, dtype=np.uint8)))
 
 
-def join(parts: Sequence[Any], height: int, width: int) -> Any:
+def join_parts(parts: Sequence[Any], height: int, width: int) -> Any:
     """One segmentation of an object's polygons [x, y, ...] and RLEs: polygons, or an RLE where
     there is one among them.
 
@@ -197,7 +197,7 @@ def join(parts: Sequence[Any], height: int, width: int) -> Any:
     return rle.merge(encoded)
 
 
-def _below(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
+def _find_files(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
     """Files of these suffixes below a folder, sorted, but those whose path has a hidden part."""
     found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     return sorted(

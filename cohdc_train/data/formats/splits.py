@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
-from cohdc_train.data.formats.base import Source, SourceImage
+from cohdc_train.data.formats.base import SourceDataset, SourceImage
 from cohdc_train.errors import DataError
 
 TEST = "test"
-TEST_LEFT_OUT = "image of the test split"
+TEST_SKIPPED = "image of the test split"
 _NAMES = {
     **dict.fromkeys(("train", "training"), "train"),
     **dict.fromkeys(("val", "valid", "validation"), "val"),
@@ -35,7 +35,7 @@ def split_of(root: Path, *paths: Path) -> str:
     return ""
 
 
-def settle_splits(root: Path, source: Source) -> None:
+def settle_splits(root: Path, source: SourceDataset) -> None:
     """Keep the source's own split, or gather the images that a split is drawn from.
 
     With images of both train and val the split is the source's own, and images of neither are left
@@ -53,10 +53,10 @@ def settle_splits(root: Path, source: Source) -> None:
         fix = "to use them, convert the folder or file named test by itself"
         raise DataError(f"{root}: all {len(test)} images are of the test split; {fix}")
     for path in sorted(test - val):
-        source.leave_out(TEST_LEFT_OUT, str(path))
+        source.skip(TEST_SKIPPED, str(path))
     if "train" in parts and "val" in parts:
         for image in parts.pop("", []):
-            source.leave_out("image of neither train, val nor test", str(image.path))
+            source.skip("image of neither train, val nor test", str(image.path))
         source.splits = {name: parts[name] for name in ("train", "val")}
         return
     source.splits = {"": [image for images in parts.values() for image in images]}

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from cohdc_train.data.formats.base import (
-    Source,
+    SourceDataset,
     SourceImage,
     SourceObject,
     annotation_files,
     ellipse,
-    leave_out_strays,
-    numbers,
     open_image,
+    parse_numbers,
     read_lines,
     rectangle,
+    skip_unlisted,
 )
 from cohdc_train.data.formats.splits import TEST, settle_splits, split_named, split_of
 from cohdc_train.data.layout import load_json
@@ -33,7 +33,7 @@ _NEEDS = {
 }
 
 
-def read_via(root: Path, attribute: str | None = None, names: Path | None = None) -> Source:
+def read_via(root: Path, attribute: str | None = None, names: Path | None = None) -> SourceDataset:
     """A folder of images and VIA's JSON files, or one such file with its images beside it.
 
     attribute: the region attribute that holds the class; the only one when there is only one.
@@ -42,7 +42,7 @@ def read_via(root: Path, attribute: str | None = None, names: Path | None = None
     are the source's own split. Raises DataError in one line naming the file, the image and the
     region, or the attributes to choose from.
     """
-    source = Source()
+    source = SourceDataset()
     contents = {path: list(_entries(path)) for path in annotation_files(root)}
     split_of_file = {path: _split_of_file(root, path) for path in contents}
     learned = [content for path, content in contents.items() if split_of_file[path] != TEST]
@@ -54,9 +54,9 @@ def read_via(root: Path, attribute: str | None = None, names: Path | None = None
             image = _image(path, folder, str(entry["filename"]))
             split = split_of_file[path] or split_of(root, image.path)
             if split != TEST:
-                image = image.holding(_objects(where, _regions(entry), chosen, only, source))
+                image = image.with_objects(_objects(where, _regions(entry), chosen, only, source))
             source.add(split, image)
-    leave_out_strays(root, source, "image that no JSON lists")
+    skip_unlisted(root, source, "image that no JSON lists")
     settle_splits(root, source)
     return source
 
@@ -141,7 +141,7 @@ def _image(path: Path, folder: str, name: str) -> SourceImage:
 
 
 def _objects(
-    where: str, regions: Sequence[Row], attribute: str, only: str | None, source: Source
+    where: str, regions: Sequence[Row], attribute: str, only: str | None, source: SourceDataset
 ) -> list[SourceObject]:
     """The objects of one image. only: the class of all of them, where there is no attribute."""
     objects = []
@@ -151,9 +151,9 @@ def _objects(
         kind = str(shape.get("name"))
         names = [only] if only else _classes(region["region_attributes"].get(attribute))
         if kind not in _NEEDS:
-            source.leave_out(f"region of shape {kind!r}", here)
+            source.skip(f"region of shape {kind!r}", here)
         elif len(names) != 1:
-            source.leave_out(
+            source.skip(
                 "region of several classes" if names else f"region without {attribute!r}", here
             )
         else:
@@ -174,14 +174,16 @@ def _outline(shape: Row, where: str) -> list[float]:
     try:
         if kind == "polygon":
             points = zip(
-                numbers(shape["all_points_x"]), numbers(shape["all_points_y"]), strict=True
+                parse_numbers(shape["all_points_x"]),
+                parse_numbers(shape["all_points_y"]),
+                strict=True,
             )
             return [value for point in points for value in point]
-        values = numbers(shape[key] for key in _NEEDS[kind])
+        values = parse_numbers(shape[key] for key in _NEEDS[kind])
         if kind == "rect":
             x, y, width, height = values
             return rectangle(x, y, x + width, y + height)
         cx, cy, rx, ry = values if kind == "ellipse" else (*values, values[-1])
-        return ellipse(cx, cy, rx, ry, *numbers([shape.get("theta", 0)]))
+        return ellipse(cx, cy, rx, ry, *parse_numbers([shape.get("theta", 0)]))
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where}: {kind} needs {', '.join(_NEEDS[kind])}") from error

@@ -10,11 +10,11 @@ from typing import Any
 import yaml
 
 from cohdc_train.data.formats.base import (
-    Source,
+    SourceDataset,
     SourceImage,
     SourceObject,
-    numbers,
     open_image,
+    parse_numbers,
     read_lines,
     rectangle,
 )
@@ -23,10 +23,10 @@ from cohdc_train.images import IMAGE_SUFFIXES
 from cohdc_train.types import Row
 
 _SPLITS = ("train", "val")
-_FARTHEST = 2.0  # image sides; farther out, a coordinate is no normalised one
+_FARTHEST = 2.0  # image sides; farther out, a coordinate is no normalized one
 
 
-def read_yolo(root: Path) -> Source:
+def read_yolo(root: Path) -> SourceDataset:
     """A data.yaml, or the folder with it: `names`, and `train` and `val`, each a folder, a list
     file, or several.
 
@@ -36,12 +36,12 @@ def read_yolo(root: Path) -> Source:
     """
     path = _find_yaml(root)
     content = _load_yaml(path)
-    source = Source(class_names=_names(path, content.get("names")))
+    source = SourceDataset(class_names=_names(path, content.get("names")))
     for split in _SPLITS:
         images = sorted(set(_images(path, content, split)))
         source.splits[split] = [_read_image(image, source) for image in images]
     if content.get("test"):
-        source.leave_out("test split", str(path))
+        source.skip("test split", str(path))
     return source
 
 
@@ -133,23 +133,23 @@ def _label_file(image: Path) -> Path:
     return Path(*parts).with_suffix(".txt")
 
 
-def _read_image(path: Path, source: Source) -> SourceImage:
+def _read_image(path: Path, source: SourceDataset) -> SourceImage:
     image = open_image(path)
     labels = _label_file(path)
     if not labels.exists():
         source.note("image without a label file: no objects", str(path))
         return image
-    return image.holding(
+    return image.with_objects(
         [_object(f"{labels}:{number}", line, image, source) for number, line in read_lines(labels)]
     )
 
 
-def _object(where: str, line: str, image: SourceImage, source: Source) -> SourceObject:
+def _object(where: str, line: str, image: SourceImage, source: SourceDataset) -> SourceObject:
     """The object of one row."""
     names = source.class_names or ()
     index, *words = line.split()
     try:
-        values = numbers(words)
+        values = parse_numbers(words)
         label = int(float(index)) if float(index).is_integer() else -1
     except ValueError as error:
         raise DataError(f"{where}: not a row of numbers") from error
