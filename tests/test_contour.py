@@ -115,7 +115,7 @@ def test_floor_holds_and_vertices_fall(seed: int, floor: float, method: ContourM
 
 @given(SEEDS, st.integers(0, 20), st.integers(0, 20), st.sampled_from(METHODS))
 @settings(max_examples=25, deadline=None)
-def test_a_moved_mask_has_the_moved_polygon(
+def test_moved_mask_has_the_moved_polygon(
     seed: int, dx: int, dy: int, method: ContourMethod
 ) -> None:
     mask = blob(seed)
@@ -132,7 +132,7 @@ def test_a_moved_mask_has_the_moved_polygon(
             assert np.allclose(ring + np.array([dx, dy]), moved_ring, atol=1e-9)
 
 
-def test_beetles_need_fewer_vertices_than_bisection() -> None:
+def test_vertex_search_needs_fewer_vertices_than_bisection() -> None:
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     disc = (x - 60) ** 2 + (y - 48) ** 2 < 40**2
     polygons = trace(disc)
@@ -149,7 +149,7 @@ def test_same_seed_same_polygon() -> None:
     assert all(np.array_equal(a.outer, b.outer) for a, b in zip(first, again, strict=True))
 
 
-def test_fixed_tolerance_knows_no_floor() -> None:
+def test_fixed_tolerance_ignores_iou_floor() -> None:
     polygons = trace(blob(5))
     coarse, fine = (
         simplify(polygons, 1.0, "dp", epsilon=6),
@@ -178,7 +178,7 @@ def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
 
 @given(SEEDS, FLOORS, st.sampled_from(WITH_FLOOR))
 @settings(max_examples=30, deadline=None)
-def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(
+def test_rings_do_not_cross_and_keep_orientation(
     seed: int, floor: float, method: ContourMethod
 ) -> None:
     """Holes turn against their outer ring."""
@@ -196,7 +196,7 @@ def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(
     assert all(turn(hole) == -turn(polygon.outer) for polygon in simpler for hole in polygon.holes)
 
 
-def test_crossing_tells_a_bow_tie_from_a_square_and_touching_from_crossing() -> None:
+def test_rings_cross_for_bow_tie_but_not_for_touching_squares() -> None:
     square = np.array([[0, 0], [4, 0], [4, 4], [0, 4]], float)
     assert not rings_cross([square])
     assert rings_cross([square[[0, 2, 1, 3]]])
@@ -206,7 +206,7 @@ def test_crossing_tells_a_bow_tie_from_a_square_and_touching_from_crossing() -> 
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_coverage_by_crossings_is_coverage_by_filling(seed: int) -> None:
+def test_iou_by_crossings_equals_iou_by_filling(seed: int) -> None:
     """Of rings that cross themselves too."""
     mask = blob(seed)
     evaluator, rng = IoUEvaluator(polygons := trace(mask)), np.random.default_rng(seed)
@@ -218,7 +218,7 @@ def test_coverage_by_crossings_is_coverage_by_filling(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_difference_of_edges_is_what_a_moved_vertex_changes(seed: int) -> None:
+def test_added_pixels_of_edges_equal_change_by_moved_vertex(seed: int) -> None:
     """The pixels that only one of outline and polygon has, counted by filling."""
     mask = blob(seed)
     evaluator, rng = IoUEvaluator(trace(mask)), np.random.default_rng(seed)
@@ -235,7 +235,7 @@ def test_difference_of_edges_is_what_a_moved_vertex_changes(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_a_turned_mask_has_the_turned_outline(seed: int) -> None:
+def test_turned_mask_has_the_turned_outline(seed: int) -> None:
     mask = blob(seed)
     turned = trace(np.rot90(mask))  # (x, y) goes to (y, width - x)
     points = {tuple(p) for polygon in trace(mask) for ring in polygon.rings for p in ring.tolist()}
@@ -280,7 +280,7 @@ def test_odd_masks_have_outlines_that_keep_the_floor(name: str, method: ContourM
         assert count_vertices(simpler) == 4
 
 
-def test_a_huge_mask_is_traced_and_simplified() -> None:
+def test_huge_mask_is_traced_and_simplified() -> None:
     """8000 x 8000 px; with a full frame's area it would take minutes if a step were quadratic in
     pixels.
     """
@@ -293,7 +293,7 @@ def test_a_huge_mask_is_traced_and_simplified() -> None:
     assert view.any()
 
 
-def test_a_ring_turned_inside_out_is_not_valid() -> None:
+def test_ring_of_wrong_orientation_is_not_valid() -> None:
     mask = np.zeros((4, 4), bool)
     mask[:, 0] = mask[3] = True
     evaluator = IoUEvaluator(trace(mask))
@@ -302,7 +302,7 @@ def test_a_ring_turned_inside_out_is_not_valid() -> None:
     assert not evaluator.is_valid([Polygon(outline.outer[::-1])])
 
 
-def test_a_hole_must_turn_against_its_outer_ring() -> None:
+def test_hole_must_have_opposite_orientation() -> None:
     mask = np.ones((6, 6), bool)
     mask[2:4, 1:5] = False
     (outline,) = trace(mask)
@@ -313,14 +313,14 @@ def test_a_hole_must_turn_against_its_outer_ring() -> None:
 
 @given(SEEDS, st.sampled_from([0.5, 0.8]))
 @settings(max_examples=60, deadline=None)
-def test_the_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
+def test_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
     """Where a vertex's move may turn a ring over."""
     mask = blob(seed)[20:36, 30:46]
     if mask.any():
         assert iou(rasterize(simplify(trace(mask), floor, "bas_dp"), mask.shape), mask) >= floor
 
 
-def test_an_unknown_method_is_named() -> None:
+def test_unknown_method_is_named() -> None:
     with pytest.raises(
         ValueError, match="contour method 'rdp'; there are bisection, bas_dp, dp, visvalingam"
     ):

@@ -56,9 +56,7 @@ def test_bracket_ends_when_its_ends_differ_by_one_vertex() -> None:
 
 @given(st.lists(st.integers(3, 9), min_size=1, max_size=4), st.integers(0, 20))
 @settings(max_examples=60, deadline=None)
-def test_beetles_of_a_turn_are_no_neighbors_and_every_beetle_gets_its_turn(
-    sizes: list[int], first: int
-) -> None:
+def test_vertices_that_move_together_are_no_neighbors(sizes: list[int], first: int) -> None:
     rings = []
     for k, size in enumerate(sizes):
         angle = np.arange(size) * 2 * np.pi / size
@@ -75,9 +73,7 @@ def test_beetles_of_a_turn_are_no_neighbors_and_every_beetle_gets_its_turn(
 
 @given(st.floats(4, 25), st.integers(0, 1000))
 @settings(max_examples=30, deadline=None)
-def test_what_f_adds_up_to_is_the_pixels_that_only_one_of_the_two_has(
-    radius: float, seed: int
-) -> None:
+def test_sum_of_f_counts_differing_pixels(radius: float, seed: int) -> None:
     """Through moves and drops, of one vertex, of several and of a whole part; counted by filling at
     the end.
     """
@@ -96,7 +92,7 @@ def test_what_f_adds_up_to_is_the_pixels_that_only_one_of_the_two_has(
         assert swarm.approximate_iou() == pytest.approx(swarm.iou(), abs=0.01)
 
 
-def test_a_small_part_goes_as_a_whole_and_a_larger_one_stays() -> None:
+def test_small_part_is_dropped_and_large_part_stays() -> None:
     """Bisection keeps the small one, as it has more than two vertices."""
     small, large = trace(two_discs(4)), trace(two_discs(12))
     assert len(simplify(small, 0.95)) == 2
@@ -116,7 +112,7 @@ def test_moves_after_the_last_drop_raise_the_iou() -> None:
     assert max(spare) > 0.005
 
 
-def test_without_moves_there_is_nothing_but_dropping() -> None:
+def test_search_without_moves_only_drops_vertices() -> None:
     polygons = trace(two_discs(25))
     simpler = simplify(polygons, 0.95, "bas_dp", search=BeetleSearch(n=0))
     corners = {tuple(p) for polygon in polygons for p in polygon.outer.tolist()}

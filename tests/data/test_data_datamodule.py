@@ -33,7 +33,7 @@ def test_classes_come_from_the_file(tmp_path: Path) -> None:
     ]
 
 
-def test_a_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
+def test_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
     data = module(toys.folder(tmp_path))
     torch.manual_seed(1)
     batches = list(data.train_dataloader())
@@ -120,7 +120,7 @@ def test_validation_images_are_untouched(tmp_path: Path) -> None:
     "ignore:This DataLoader will create 2 worker processes"
 )  # torch's advice on one core
 @pytest.mark.parametrize("workers", [0, 2])
-def test_the_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
+def test_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
     root = toys.folder(tmp_path)
     runs = []
     for seed in (5, 5, 6):
@@ -181,7 +181,7 @@ def test_hundreds_of_objects_on_a_large_image_take_little_memory(tmp_path: Path)
     assert mebibytes < 1000
 
 
-def test_cutouts_are_pasted_and_not_trained_on(tmp_path: Path) -> None:
+def test_paste_roots_are_pasted_and_not_trained_on(tmp_path: Path) -> None:
     pictures, others = toys.folder(tmp_path / "a", train=2), toys.folder(tmp_path / "b", train=5)
     augment = Augmentation(copy_paste=1.0, scale_jitter=(1.0, 1.0))
     data = module(pictures, paste_roots=[others], augment=augment)

@@ -51,7 +51,7 @@ def issues(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[str
 COUNTED = {
     **dict.fromkeys(
         ("contour-missing", "contour-number", "contour-short", "contour-odd", "contour-empty"),
-        "dropped|left",
+        "dropped|skipped",
     ),
     **dict.fromkeys(("box-degenerate", "box-inverted"), "degenerate box"),
     "box-outside": "clipped",
@@ -67,7 +67,7 @@ def train_once(paths: dict[str, Any]) -> int:
     assert all(torch.isfinite(batch.images).all() for batch in batches)
     network = MaskRCNN(data.num_classes, TINY)
     for batch in batches:
-        total = sum(network.reading_report(batch.images, batch.targets).values())
+        total = sum(network.losses(batch.images, batch.targets).values())
         assert torch.isfinite(total)
         total.backward()
     gradients = [p.grad for p in network.parameters() if p.requires_grad]
@@ -76,7 +76,7 @@ def train_once(paths: dict[str, Any]) -> int:
     return sum(len(target["labels"]) for batch in batches for target in batch.targets)
 
 
-def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(
+def test_sound_folder_has_only_note_about_id_gap(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, found = issues(broken_folders.whole(tmp_path / "a"))
@@ -88,7 +88,7 @@ def test_a_sound_folder_has_nothing_but_the_gap_in_its_ids(
     assert (tmp_path / "a" / "seen" / "annotations.jpg").stat().st_size > 1000
 
 
-def test_the_corpus_is_large_and_shows_most_kinds() -> None:
+def test_broken_folders_cover_most_issue_kinds() -> None:
     shown = {case.kind for case in broken_folders.BROKEN.values()}
     assert len(broken_folders.BROKEN) >= 50
     assert set(ISSUE_KINDS) - shown == {
@@ -100,7 +100,7 @@ def test_the_corpus_is_large_and_shows_most_kinds() -> None:
 
 
 @pytest.mark.parametrize("name", broken_folders.BROKEN)
-def test_it_is_found_training_agrees_and_the_mend_holds(
+def test_issue_is_found_agrees_with_training_and_is_fixed(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     case = broken_folders.BROKEN[name]
@@ -127,10 +127,10 @@ def test_it_is_found_training_agrees_and_the_mend_holds(
             )
         assert train_once({"root": root}) > 5
     if case.fixed:
-        check_mended(tmp_path / "mended", root)
+        assert_fixed_folder_trains(tmp_path / "mended", root)
 
 
-def check_mended(folder: Path, root: Path) -> None:
+def assert_fixed_folder_trains(folder: Path, root: Path) -> None:
     """The mended files train without a loss, hold no error, and with the removed rows all that
     there was.
     """
@@ -166,9 +166,7 @@ def check_mended(folder: Path, root: Path) -> None:
     assert still <= {"image-color", "category-unused", "class-only-val"}
 
 
-def test_the_mend_never_overwrites_what_it_reads(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fix_never_overwrites_its_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = broken_folders.build(tmp_path / "a", "box elsewhere")
     before = (root / "instances_train.json").read_bytes()
     assert main(["data", "doctor", str(root), "--fix", str(root)]) == 1
@@ -191,7 +189,7 @@ def test_doctor_keeps_files_it_did_not_write(
     assert (out / name).read_text() == "mine"
 
 
-def test_a_class_that_only_validation_has_objects_of(tmp_path: Path) -> None:
+def test_class_with_objects_only_in_validation_is_found(tmp_path: Path) -> None:
     root = toys.folder(tmp_path / "a")
     content = json.loads((root / "instances_train.json").read_text())
     content["annotations"] = [row for row in content["annotations"] if row["category_id"] == 10][1:]
@@ -205,7 +203,7 @@ def test_a_class_that_only_validation_has_objects_of(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(0, 4000), min_size=1, max_size=9))
-def test_runs_are_read_as_pycocotools_writes_them(runs: list[int]) -> None:
+def test_run_lengths_equal_those_of_pycocotools(runs: list[int]) -> None:
     from pycocotools import mask as rle
 
     pixels = sum(runs)
@@ -220,7 +218,7 @@ def test_runs_are_read_as_pycocotools_writes_them(runs: list[int]) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_anchor_overlap_is_torchvisions(seed: int) -> None:
+def test_anchor_overlap_equals_torchvision(seed: int) -> None:
     rng = np.random.default_rng(seed)
     canvas, scales = (128, 192), (16, 32, 64, 128, 100)
     corner = rng.uniform((0, 0), (150, 90), (12, 2))
@@ -232,3 +230,15 @@ def test_anchor_overlap_is_torchvisions(seed: int) -> None:
     (anchors,) = generator(ImageList(torch.zeros(1, 3, *canvas), [canvas]), maps)
     best = box_iou(torch.from_numpy(boxes).float(), anchors).amax(dim=1).numpy()
     np.testing.assert_allclose(best_overlap(boxes, scales, canvas), best, atol=1e-4)
+
+
+def test_anchors_are_examined_on_automatic_canvas(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = broken_folders.whole(tmp_path / "a")
+    height, width = CocoDataModule(root).canvas
+    main(["data", "doctor", str(root)])
+    assert f"on the canvas that cohdc fit chooses, {height}x{width} px" in capsys.readouterr().out
+
+    main(["data", "doctor", str(root), "--canvas", "[64, 96]"])
+    assert "on the canvas of --canvas, 64x96 px" in capsys.readouterr().out

@@ -5,14 +5,14 @@ from pathlib import Path
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import converted, image_of, masks_of, refused
+from conversion import assert_refused, converted, image_of, masks_of
 from PIL import Image
 
 from cohdc_train.data.convert import convert
 from cohdc_train.errors import DataError
 
 
-def test_voc_the_majority_names_an_object_and_void_is_nothing(
+def test_voc_class_is_majority_and_void_is_background(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = toys.voc(tmp_path / "source")
@@ -40,7 +40,7 @@ LABELMAP = "# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:10,20,30::\
 
 
 @pytest.mark.parametrize("palette", [True, False])
-def test_voc_colors_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
+def test_voc_reads_colors_of_labelmap(tmp_path: Path, palette: bool) -> None:
     """As CVAT writes it: no split, PNGs of colors, images of any type in sub folders."""
     root = tmp_path / "source"
     objects, classes = toys.voc_labels()
@@ -75,7 +75,7 @@ def test_voc_colors_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
         convert("voc", root, tmp_path / "out")
 
 
-def test_voc_names_of_a_file_number_the_classes(tmp_path: Path) -> None:
+def test_voc_class_ids_follow_names_file(tmp_path: Path) -> None:
     root = toys.voc(tmp_path / "source")
     lines = ["__ignore__", "_background_", *(f"class {i}" for i in range(1, 16))]
     splits = converted("voc", root, names=toys.write(tmp_path / "names.txt", "\n".join(lines)))
@@ -124,7 +124,7 @@ VOC_ERRORS = {
 
 
 @pytest.mark.parametrize("message", VOC_ERRORS)
-def test_voc_errors(tmp_path: Path, message: str) -> None:
+def test_voc_error_names_file_and_line(tmp_path: Path, message: str) -> None:
     root = toys.voc(tmp_path / "source")
     VOC_ERRORS[message](root)
-    refused(tmp_path, "voc", root, message)
+    assert_refused(tmp_path, "voc", root, message)

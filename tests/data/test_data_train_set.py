@@ -56,14 +56,14 @@ def samples(images: list[CocoImage], augment: Augmentation, count: int = 20, **k
     return [CocoTrainDataset(images, (HEIGHT, WIDTH), augment, **kwargs)[0] for _ in range(count)]
 
 
-def test_without_pasting_a_sample_is_its_image(two: list[CocoImage]) -> None:
+def test_sample_without_pasting_equals_image(two: list[CocoImage]) -> None:
     pixels, target = samples(two, STILL, 1)[0]
     assert target["boxes"].tolist() == [[10, 10, 70, 50]]
     assert target["size"] == (HEIGHT, WIDTH)
     assert torch.equal(pixels[0] == 100, target["masks"][0] > 0)
 
 
-def test_a_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
+def test_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
     seen = set()
     for pixels, target in samples(two, PASTING):
         labels = target["labels"].tolist()
@@ -75,7 +75,7 @@ def test_a_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
     assert (1, 2) in seen
 
 
-def test_an_object_hardly_seen_any_more_is_ignored(tmp_path: Path) -> None:
+def test_nearly_hidden_object_is_ignored(tmp_path: Path) -> None:
     """Its rest (4 of 64 rows' worth) is neither an object nor background."""
     small = image(tmp_path, 1, 100, [rectangle(1, 1, (30, 20, 21, 20))])
     large = image(tmp_path, 2, 200, [rectangle(2, 2, (20, 10, 30, 40))])
@@ -96,7 +96,7 @@ def test_nothing_is_pasted_into_the_padding(tmp_path: Path) -> None:
         assert target["boxes"][-1].tolist() == [20, 10, 50, 30]
 
 
-def test_giver_without_objects_and_crowds(tmp_path: Path) -> None:
+def test_paste_source_without_objects_or_with_crowds_changes_nothing(tmp_path: Path) -> None:
     empty = image(tmp_path, 1, 100, [])
     crowd = image(tmp_path, 2, 200, [rectangle(1, 1, (10, 10, 20, 20), crowd=True)])
     for index, expected in ((0, []), (1, [[10, 10, 30, 30]])):
@@ -121,6 +121,6 @@ def test_mini_masks_lie_on_their_boxes(two: list[CocoImage]) -> None:
     assert none["frames"].shape == (0, 4)
 
 
-def test_only_givers_give(two: list[CocoImage]) -> None:
+def test_objects_come_only_from_paste_sources(two: list[CocoImage]) -> None:
     pasted = samples(two[:1], PASTING, 10, paste_sources=two[1:])
     assert [t["labels"].tolist() for _, t in pasted] == [[1, 2]] * 10

@@ -42,7 +42,7 @@ def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     torch.manual_seed(seed)
     pixels, whole = picture(height, width)
     placement = Placement.draw((height, width), (rows, columns), Augmentation(flip=float(flip)))
-    assert placement.mirror_fingerprints == flip
+    assert placement.mirrored == flip
     image, mask = placement.image(pixels), placement.mask(whole) > 0
     assert image.shape == (3, rows, columns)
     assert mask.shape == (rows, columns)
@@ -85,7 +85,7 @@ def test_without_jitter_the_image_fits_and_the_rest_is_zero() -> None:
     assert mask_boxes(placement.mask(mask)[None]).tolist() == [[12, 15, 30, 30]]
 
 
-def test_the_jitter_covers_its_range() -> None:
+def test_scale_jitter_covers_its_range() -> None:
     torch.manual_seed(0)
     placements = [
         Placement.draw((60, 60), (60, 60), Augmentation(0.5, (0.5, 1.5))) for _ in range(300)
@@ -94,16 +94,16 @@ def test_the_jitter_covers_its_range() -> None:
     assert 0.5 <= min(scales) < 0.53
     assert 1.47 < max(scales) <= 1.51
     assert len({(p.top, p.left) for p in placements}) > 50
-    assert 100 < sum(p.mirror_fingerprints for p in placements) < 200
+    assert 100 < sum(p.mirrored for p in placements) < 200
 
 
 @pytest.mark.parametrize("jitter", [(0.0, 1.0), (1.5, 0.5)])
-def test_a_senseless_jitter_is_refused(jitter: tuple[float, float]) -> None:
+def test_invalid_scale_jitter_is_refused(jitter: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="scale_jitter"):
         Augmentation(scale_jitter=jitter)
 
 
-def test_a_probability_above_one_is_refused() -> None:
+def test_probability_above_one_is_refused() -> None:
     with pytest.raises(ValueError, match="copy_paste 2"):
         Augmentation(copy_paste=2)
 
@@ -123,7 +123,7 @@ def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> No
     assert (blank[3, :, 1:, 1:] == 0).all()
 
 
-def test_a_moving_cameras_faults_leave_an_image_in_its_range() -> None:
+def test_degraded_images_stay_in_value_range() -> None:
     """Every fault at once, on stripes: the image is another one, blurred and darker or lighter, and
     still an image.
     """

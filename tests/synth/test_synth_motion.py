@@ -51,7 +51,7 @@ def test_camera_moves_smoothly_about_the_eye(motion: str) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), people=st.integers(1, 4))
-def test_a_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: int) -> None:
+def test_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: int) -> None:
     distances = 1.2 + 0.35 * np.arange(people)
     ways = crowd(np.random.default_rng(seed), TIMES, distances, 0.85)
     assert len(ways) == people
@@ -86,7 +86,7 @@ def angle(first: np.ndarray, second: np.ndarray) -> float:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_a_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
+def test_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
     times = np.arange(400) / 30
     eye = np.array([0.0, 3.5, 1.4])
     poses = camera_path(np.random.default_rng(seed), times, "loop", eye)
@@ -107,7 +107,7 @@ def test_a_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000), people=st.integers(1, 4))
-def test_a_crowd_led_round_stays_as_far_from_the_camera_as_it_was(seed: int, people: int) -> None:
+def test_crowd_following_camera_keeps_its_distance(seed: int, people: int) -> None:
     rng = np.random.default_rng(seed)
     eyes = camera_path(rng, TIMES, "loop", np.zeros(3))[:, :2, 3]
     ways = crowd(rng, TIMES, 1.2 + 0.35 * np.arange(people), 0.75)
@@ -148,7 +148,7 @@ def test_people_stop_for_seconds_in_the_view_and_walk_on(seed: int, people: int)
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_a_cart_rolls_to_and_fro_and_its_pusher_stays_behind_it(seed: int) -> None:
+def test_cart_moves_back_and_forth_with_pusher_behind(seed: int) -> None:
     rng = np.random.default_rng(seed)
     line = back_and_forth(rng, TIMES, 1.2, (0.5, 1.0), 0.7)
     cart, pusher = cart_path(rng, TIMES, line, -1.0)
@@ -163,7 +163,7 @@ def test_a_cart_rolls_to_and_fro_and_its_pusher_stays_behind_it(seed: int) -> No
     )
 
 
-def test_who_comes_up_to_the_camera_stays_before_it_wherever_it_moves() -> None:
+def test_approaching_person_stays_before_moving_camera() -> None:
     poses = camera_path(np.random.default_rng(3), TIMES, "xyz", np.zeros(3))
     way = approach_camera(TIMES, poses)
     offset = way.position - poses[:, :2, 3]

@@ -46,7 +46,7 @@ def test_depth_of_a_plane(
     np.testing.assert_allclose(hits.depth[inside], expected[inside], rtol=2e-4)
 
 
-def test_ball_covers_its_circle_and_owns_its_pixels() -> None:
+def test_ball_covers_its_circle_in_instance_image() -> None:
     ball = solids.ellipsoid((0, 0, 3), (0.5, 0.5, 0.5), 0).named(7, 0)
     camera = RenderCamera(200, 200, 99.5, 99.5, 200, 200)
     found = render(ball, Atlas([GRAY] * 8), LIGHT, camera, looking_at_z()).instance
@@ -57,7 +57,7 @@ def test_ball_covers_its_circle_and_owns_its_pixels() -> None:
     )
 
 
-def test_nearest_instance_wins_and_nothing_is_zero() -> None:
+def test_nearest_instance_is_visible_and_background_is_zero() -> None:
     near = solids.quad((-0.2, -0.2, 1), (0.4, 0, 0), (0, 0.4, 0), 0).named(2, 0)
     far = solids.quad((-0.6, -0.6, 2), (1.2, 0, 0), (0, 1.2, 0), 0).named(1, 0)
     view = render(solids.join([far, near]), Atlas([GRAY]), LIGHT, CAMERA, looking_at_z())
@@ -70,7 +70,7 @@ def test_nearest_instance_wins_and_nothing_is_zero() -> None:
     np.testing.assert_array_equal(view.rgb.sum(axis=2) == 0, view.instance == 0)
 
 
-def test_texture_is_laid_on_upright_at_every_distance() -> None:
+def test_texture_is_upright_at_every_distance() -> None:
     texture = np.zeros((64, 128, 3), dtype=np.uint8)
     texture[:32, 64:] = (200, 0, 0)  # upper right
     texture[32:, :64] = (0, 0, 200)  # lower left

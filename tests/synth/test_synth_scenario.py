@@ -68,7 +68,7 @@ def check_shares(scene: RenderedScene) -> None:
     assert shares.max() < 0.8
 
 
-def test_one_fills_the_view_for_a_stretch() -> None:
+def test_one_person_fills_the_view_for_some_time() -> None:
     scene = scene_of("xyz", 2, action="fill_view")
     shares = np.array([people_in(scene, view) for view in views(scene, 5)])
     assert np.all(shares[14:18] > 0.7), "a second and more"
@@ -76,7 +76,7 @@ def test_one_fills_the_view_for_a_stretch() -> None:
     assert shares[-1] < 0.5
 
 
-def test_a_cart_alone_is_a_mover_but_nobody(tmp_path: Path) -> None:
+def test_cart_alone_moves_but_is_no_person(tmp_path: Path) -> None:
     sequence(
         tmp_path / "s", frames=90, size=SIZE, seed=7, people=0, scene=SceneConfig(cart="alone")
     )
@@ -100,7 +100,7 @@ def test_a_cart_alone_is_a_mover_but_nobody(tmp_path: Path) -> None:
     assert info["scene"] == {"action": "walk", "cart": "alone", "walls": "textured"}
 
 
-def test_a_cart_is_pushed_across_the_view_and_changes_the_depth_there() -> None:
+def test_cart_is_pushed_across_the_view_and_changes_the_depth_there() -> None:
     scene = scene_of("static", 1, cart="pushed")
     pusher, cart = scene.actors
     assert (pusher.is_person, cart.is_person) == (True, False)
@@ -118,7 +118,7 @@ def test_a_cart_is_pushed_across_the_view_and_changes_the_depth_there() -> None:
     )
 
 
-def test_who_stops_does_not_move_at_all_and_then_goes() -> None:
+def test_stopped_person_does_not_move_and_then_walks() -> None:
     scene = scene_of("xyz", 2, action="stop_and_go")
     for actor in scene.actors:
         speed = np.array([max_speed(actor, k, FRAMES, 30) for k in range(0, FRAMES, 6)])
@@ -126,7 +126,7 @@ def test_who_stops_does_not_move_at_all_and_then_goes() -> None:
         assert speed.max() > 0.5
 
 
-def test_the_seated_hardly_move_and_their_chairs_do_not() -> None:
+def test_seated_people_hardly_move_and_chairs_stay() -> None:
     scene = scene_of("static", 3, action="sit")
     people, chairs = scene.actors[:3], scene.actors[3:]
     assert len(chairs) == 3
@@ -156,7 +156,7 @@ def loop() -> RenderedScene:
     return scene_of("loop", 2, 300)
 
 
-def test_a_loop_sees_furniture_in_every_direction_and_its_first_view_again(
+def test_loop_sees_furniture_in_every_direction_and_its_first_view_again(
     loop: RenderedScene,
 ) -> None:
     atlas, camera = loop.atlas(), RenderCamera.freiburg3((96, 128))
@@ -223,14 +223,16 @@ def test_same_seed_same_bytes(tmp_path: Path, options: dict[str, object]) -> Non
         ({"people": 13}, "people: 13 is not in 0..12"),
     ],
 )
-def test_bad_settings_in_one_line(tmp_path: Path, options: dict[str, object], message: str) -> None:
+def test_invalid_scene_is_refused_in_one_line(
+    tmp_path: Path, options: dict[str, object], message: str
+) -> None:
     with pytest.raises(DataError, match=message) as caught:
         sequence(tmp_path / "s", **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_takes_the_scene(tmp_path: Path) -> None:
+def test_command_takes_the_scene(tmp_path: Path) -> None:
     options = ["--frames", "2", "--size", "[48, 64]", "--people", "1", "--motion", "static"]
     assert main(["synth", "sequence", str(tmp_path / "s"), *options, "--scene.action", "sit"]) == 0
     assert json.loads((tmp_path / "s" / "info.json").read_text())["scene"]["action"] == "sit"

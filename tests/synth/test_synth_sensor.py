@@ -55,7 +55,7 @@ def test_edges_and_grazing_surfaces_lose_readings() -> None:
     assert (grazing == 0).mean() == pytest.approx(0.8, abs=0.05)
 
 
-def test_photograph_adds_the_noise_it_says() -> None:
+def test_sensor_noise_has_given_sigma() -> None:
     rgb = np.full((100, 120, 3), 0.5, np.float32)
     image = add_sensor_noise(rgb, np.random.default_rng(0), sigma=2.5)
     assert image.dtype == np.uint8
@@ -64,7 +64,7 @@ def test_photograph_adds_the_noise_it_says() -> None:
     assert add_sensor_noise(rgb * 9, np.random.default_rng(0)).min() > 240
 
 
-def test_smear_runs_along_its_angle_and_keeps_the_light() -> None:
+def test_motion_blur_follows_angle_and_keeps_brightness() -> None:
     image = np.zeros((21, 21, 3), np.float32)
     image[10, 10] = 1
     wide = blur_motion(image, 7, 0.0)
@@ -75,7 +75,7 @@ def test_smear_runs_along_its_angle_and_keeps_the_light() -> None:
     np.testing.assert_array_equal(blur_motion(image, 0.4, 0.0), image)
 
 
-def test_exposure_brings_any_light_to_one_brightness() -> None:
+def test_exposure_gain_gives_one_brightness() -> None:
     rgb = np.random.default_rng(0).uniform(0.1, 0.3, (40, 50, 3)).astype(np.float32)
     for light in (0.2, 1.0, 7.0):
         assert (rgb * light * exposure_gain(rgb * light)).mean() == pytest.approx(0.37, rel=0.05)

@@ -1,6 +1,4 @@
-"""One annotation of a COCO-format file under the magnifying glass: what is wrong with it, and its
-mended row.
-"""
+"""Check one annotation of a COCO-format file, and fix its row (no torch)."""
 
 from typing import Any, NamedTuple
 
@@ -10,18 +8,21 @@ from shapely import Polygon, box, clip_by_rect, get_parts
 
 from cohdc_train.data.annotations import fills_image, is_crowd, is_number_list, rle_as_text
 
-_TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
-_DISAGREE, _AGREE = (
-    0.5,
-    0.9,
-)  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
-_TINY = 4  # px
+_TOLERANCE = 1.0  # px by which a box may be wrong, or a box or contour leave the image
+# IoU of the annotated box with the contour's box. Below the first the box is wrong; above the
+# second, read as corners, the corners were written in place of width and height.
+_DISAGREE, _AGREE = 0.5, 0.9
+_TINY = 4  # px^2
 Box = tuple[float, float, float, float]
 
 
 class AnnotationReport(NamedTuple):
-    """findings: kinds. row: the mended annotation, None when it has to go. shape: its compressed
-    RLE, None likewise.
+    """Result of the checks of one annotation.
+
+    Attributes:
+        issues: kinds of issues.
+        row: the fixed annotation; None when it has to be removed.
+        shape: its compressed RLE; None when it has none.
     """
 
     issues: list[str]
@@ -30,7 +31,7 @@ class AnnotationReport(NamedTuple):
 
 
 def check_annotation(row: dict[str, Any], height: int, width: int) -> AnnotationReport:
-    """Look at segmentation, box and area of one annotation of an image of height x width px."""
+    """Check segmentation, box and area of one annotation of an image of height x width px."""
     issues: list[str] = []
     crowd = is_crowd(row)
     if crowd:
@@ -55,7 +56,8 @@ def check_annotation(row: dict[str, Any], height: int, width: int) -> Annotation
     issues += kinds
     area = row.get("area")
     if not isinstance(area, int | float) or not pixels / 2 <= area <= pixels * 2:
-        issues += ["area-wrong"] if area is not None and pixels >= _TINY else []
+        if area is not None and pixels >= _TINY:
+            issues.append("area-wrong")
         area = float(pixels)
     return AnnotationReport(
         issues, row | {"segmentation": fixed, "bbox": list(bounds), "area": area}, shape
@@ -63,8 +65,9 @@ def check_annotation(row: dict[str, Any], height: int, width: int) -> Annotation
 
 
 def fits_image(row: dict[str, Any], height: int, width: int) -> bool:
-    """Whether an annotation could be of an image of this size: its RLE's size is the same, or its
-    points lie inside.
+    """Return whether an annotation could be of an image of this size.
+
+    It could when its RLE has the same size, or when its points lie inside.
     """
     segmentation = row.get("segmentation") or []
     if isinstance(segmentation, dict):
@@ -82,7 +85,7 @@ def fits_image(row: dict[str, Any], height: int, width: int) -> bool:
 
 
 def _fix_segmentation(given: Any, height: int, width: int) -> tuple[list[str], Any]:
-    """Kinds of findings, and polygons or a compressed RLE; None when nothing is left."""
+    """Return kinds of issues, and polygons or a compressed RLE; None when nothing is left."""
     if isinstance(given, dict):
         return _fix_rle(given, height, width)
     if not isinstance(given, list):
@@ -113,7 +116,7 @@ def _fix_segmentation(given: Any, height: int, width: int) -> tuple[list[str], A
 
 
 def _polygon_fault(part: Any) -> str:
-    """Why a polygon cannot be drawn; empty when it can."""
+    """Return why a polygon cannot be drawn; empty when it can."""
     if not isinstance(part, list):
         return "contour-format"
     if not is_number_list(part, len(part)):
@@ -126,10 +129,9 @@ def _polygon_fault(part: Any) -> str:
 def _clipped(
     part: list[float], outline: Polygon, height: int, width: int
 ) -> list[list[float]] | None:
-    """What lies inside of the image of a polygon that reaches out of it; None when it does not
-    reach out.
+    """Return the part of a polygon that lies in the image; None when all of it does.
 
-    A crossing polygon, which shapely cannot cut, has its points moved to the edge.
+    A polygon that crosses itself, which shapely cannot clip, has its points moved to the border.
     """
     x0, y0, x1, y1 = outline.bounds
     if (
@@ -165,8 +167,9 @@ def _fix_rle(
 
 
 def _fix_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str], Box]:
-    """Kinds of findings and the box to keep: the annotated one, clipped, unless the contour's is
-    the better.
+    """Return kinds of issues, and the box to keep.
+
+    It is the annotated box, clipped, unless the contour's box is the better one.
     """
     if given is None:
         return ["box-missing"], tight
@@ -198,8 +201,9 @@ def _iou(a: Box, b: Box) -> float:
 
 
 def _is_near(a: Box, b: Box) -> bool:
-    """Whether no edge is off by more than the tolerance: of an object of a few px, one px is half
-    the IoU.
+    """Return whether no edge of two boxes differs by more than the tolerance.
+
+    The IoU says little about objects of a few pixels: one pixel is half of it.
     """
     edges = [(v[0], v[1], v[0] + v[2], v[1] + v[3]) for v in (a, b)]
     return all(abs(one - other) <= _TOLERANCE for one, other in zip(*edges, strict=True))

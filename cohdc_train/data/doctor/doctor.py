@@ -1,13 +1,14 @@
-"""`cohdc data doctor` and `stats`: look at a COCO-format folder without training on it (no torch)."""
+"""Check a COCO-format folder without training on it: `cohdc data doctor` and `stats` (no torch)."""
 
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
 
+from cohdc_train.data.canvas import choose_canvas
 from cohdc_train.data.coco import CocoSplit, read_split
 from cohdc_train.data.doctor.anchor_recall import recall
 from cohdc_train.data.doctor.sample_grid import draw_grid
@@ -29,30 +30,30 @@ def doctor(
     root: Path,
     fix: Path | None = None,
     out: Path | None = None,
-    canvas: tuple[int, int] = (800, 1024),
+    canvas: tuple[int, int] | Literal["auto"] = "auto",
     anchor_scales: tuple[int, ...] = (32, 64, 128, 256),
 ) -> None:
-    """Look for everything in a COCO-format folder that would stop training or make it learn or
-    score the wrong thing.
+    """Find everything in a COCO-format folder that would stop training or spoil what it learns.
 
-    Prints every finding with its count, three places and the mend, then the folder's statistics.
-    Exit code 1 when there is an error among the findings.
+    Prints every issue with its count, three places and the fix, then the folder's statistics. The
+    exit code is 1 when one of the issues is an error.
 
     Args:
         root: the folder, in any of the usual layouts.
-        fix: folder to write mended annotation files into, with `removed.json`: every row that is
-            left out, and why.
-        out: folder to write `issues.json` and `annotations.jpg`, a grid of annotated images,
-            into.
-        canvas: height and width, px, for the anchors' recall.
+        fix: folder to write fixed annotation files into, with `removed.json`: every row that was
+            removed, and why.
+        out: folder to write `issues.json` and `annotations.jpg`, a grid of annotated images, into.
+        canvas: height and width, px, for the recall of the anchors; "auto" chooses it from the
+            training images, as `cohdc fit` does.
         anchor_scales: side of the anchors, px, one per pyramid level from stride 4.
     """
     splits = [check_split(name, find_split(root, name)) for name in _SPLITS]
     _compare_splits(*splits)
     for split in splits:
-        listed = f"{len(split.content['images'])} images, {len(split.content['annotations'])} annotations"
+        images, annotations = (len(split.content[key]) for key in ("images", "annotations"))
+        usable = f"{images} images, {annotations} annotations can be used"
         print(
-            f"{split.name}: {split.files.annotations}: {listed} can be used, {len(split.removed)} rows cannot"
+            f"{split.name}: {split.files.annotations}: {usable}, {len(split.removed)} rows cannot"
         )
         print("\n".join(split.issues.lines()) or "  nothing found")
     if fix is not None:
@@ -64,9 +65,8 @@ def doctor(
     count_of = sum(len(where) for kinds in wrong.values() for where in kinds.values())
     if count_of:
         kinds = ", ".join(sorted({kind for found in wrong.values() for kind in found}))
-        raise DataError(
-            f"{root}: {count_of} errors ({kinds}): training would stop, or learn or score the wrong thing"
-        )
+        effect = "training would stop, or learn or score the wrong thing"
+        raise DataError(f"{root}: {count_of} errors ({kinds}): {effect}")
     readable = [read_split(split.name, split.files) for split in splits]
     _print_statistics(readable, canvas, anchor_scales)
     if out is not None:
@@ -74,8 +74,7 @@ def doctor(
 
 
 def stats(root: Path, classes: list[str] | None = None) -> None:
-    """Print what the splits of a COCO-format folder hold: images, objects, crowd, what had to be
-    dropped or clipped.
+    """Print what a COCO-format folder holds: images, objects, crowds, and what reading would drop.
 
     Args:
         root: the folder, in any of the usual layouts.
@@ -86,13 +85,12 @@ def stats(root: Path, classes: list[str] | None = None) -> None:
         for name, value in count(split).items():
             print(f"{split.name:<6}{name:<24}{value}")
     if set(splits[0].class_names) != set(splits[1].class_names):
-        raise DataError(
-            f"{root}: the classes of train and val differ: {splits[0].class_names} {splits[1].class_names}"
-        )
+        train, val = (split.class_names for split in splits)
+        raise DataError(f"{root}: the classes of train and val differ: {train} {val}")
 
 
 def count(split: CocoSplit) -> dict[str, Any]:
-    """The counts of one split, in the vocabulary of the paper's Table 3; one further row per class."""
+    """Return the counts of one split, named as in Table 3 of the paper, and of each class."""
     objects = [o for image in split.images for o in image.objects]
     per_class = Counter(split.class_names[o.label - 1] for o in objects if not o.crowd)
     return {
@@ -109,7 +107,7 @@ def count(split: CocoSplit) -> dict[str, Any]:
 
 
 def summary(split: CocoSplit) -> str:
-    """The counts of one split that are not zero, in one line."""
+    """Return the counts of one split that are not zero, in one line."""
     shown = [
         f"{name} {value}" for name, value in count(split).items() if name != "annotations" and value
     ]
@@ -117,7 +115,7 @@ def summary(split: CocoSplit) -> str:
 
 
 def _compare_splits(train: SplitReport, val: SplitReport) -> None:
-    """Findings between the splits: classes, and images that are in both."""
+    """Add issues between the splits: classes that differ, and images that are in both."""
     names = [
         {row["id"]: str(row["name"]) for row in split.content["categories"]}
         for split in (train, val)
@@ -143,7 +141,7 @@ def _compare_splits(train: SplitReport, val: SplitReport) -> None:
 
 
 def _write_fixed(splits: Sequence[SplitReport], folder: Path) -> None:
-    """Write the mended files and say how to train on them."""
+    """Write the fixed files, and print how to train on them."""
     paths = [folder / f"instances_{split.name}.json" for split in splits]
     for split, path in zip(splits, paths, strict=True):
         if path.exists() and path.samefile(split.files.annotations):
@@ -152,31 +150,38 @@ def _write_fixed(splits: Sequence[SplitReport], folder: Path) -> None:
     options = []
     for split, path in zip(splits, paths, strict=True):
         write_json(path, split.content)
-        options += [
-            f"--data.paths.{split.name}_json {path} --data.paths.{split.name}_images {split.files.images}"
-        ]
+        options += [f"--data.paths.{split.name}_json {path}"]
+        options += [f"--data.paths.{split.name}_images {split.files.images}"]
     write_json(folder / "removed.json", {split.name: split.removed for split in splits})
-    print(f"mended: cohdc fit {' '.join(options)}")
+    print(f"fixed: cohdc fit {' '.join(options)}")
 
 
 def _print_statistics(
-    splits: Sequence[CocoSplit], canvas: tuple[int, int], scales: Sequence[int]
+    splits: Sequence[CocoSplit], canvas: tuple[int, int] | Literal["auto"], scales: Sequence[int]
 ) -> None:
     for split in splits:
         print(summary(split))
-    print(
-        f"Table 3 columns it has images enough for: {', '.join(_table3_columns(splits)) or 'none'}"
-    )
-    print(f"anchors {list(scales)} on a canvas of {canvas[0]}x{canvas[1]} px, objects of train:")
-    boxes = _boxes(splits[0], canvas)
-    for row in recall(boxes, scales, canvas):
-        print(
-            f"  {row.size:<8}{row.objects:>7} objects   IoU >= .5: {row.at_50:6.1%}   >= .7: {row.at_70:6.1%}"
-        )
+    columns = ", ".join(_table3_columns(splits)) or "none"
+    print(f"Table 3 columns it has images enough for: {columns}")
+    train = splits[0]
+    height, width = _canvas_size(train, canvas)
+    origin = "that cohdc fit chooses" if canvas == "auto" else "of --canvas"
+    print(f"anchors {list(scales)} on the canvas {origin}, {height}x{width} px, objects of train:")
+    boxes = _boxes(train, (height, width))
+    for row in recall(boxes, scales, (height, width)):
+        shares = f"IoU >= .5: {row.at_50:6.1%}   >= .7: {row.at_70:6.1%}"
+        print(f"  {row.size:<8}{row.objects:>7} objects   {shares}")
+
+
+def _canvas_size(train: CocoSplit, canvas: tuple[int, int] | Literal["auto"]) -> tuple[int, int]:
+    """Return (height, width), px."""
+    if canvas == "auto":
+        return choose_canvas([(image.height, image.width) for image in train.images])
+    return canvas
 
 
 def _boxes(split: CocoSplit, canvas: tuple[int, int]) -> Any:
-    """[N, 4] xyxy, px on the canvas: the objects of a split."""
+    """Return the objects of a split, [N, 4] xyxy, px on the canvas."""
     rows = []
     for image in split.images:
         scale = min(canvas[0] / image.height, canvas[1] / image.width)
@@ -187,7 +192,7 @@ def _boxes(split: CocoSplit, canvas: tuple[int, int]) -> Any:
 
 
 def _table3_columns(splits: Sequence[CocoSplit]) -> list[str]:
-    """Names of the Table 3 configurations whose subsets the splits can give."""
+    """Return the names of the Table 3 configurations whose subsets the splits can give."""
     names = []
     for number in _TABLE3:
         config = yaml.safe_load(

@@ -1,6 +1,4 @@
-"""What can be wrong with a COCO-format folder: the kinds, how bad each is, and its mend (plain
-Python).
-"""
+"""Kinds of issues of a COCO-format folder: how bad each is, and its fix (plain Python)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -10,10 +8,13 @@ Severity = Literal["error", "warning", "note"]
 
 
 class IssueKind(NamedTuple):
-    """How bad a finding is, what it is, and what mends it.
+    """Kind of an issue.
 
-    "error": training stops, or what it learns or scores would be wrong. "warning": training drops,
-    clips or ignores the row and goes on. "note": worth knowing.
+    Attributes:
+        severity: "error": training stops, or what it learns or scores would be wrong. "warning":
+            training drops, clips or ignores the row and goes on. "note": worth knowing.
+        description: what is wrong.
+        fix: how to fix it.
     """
 
     severity: Severity
@@ -36,7 +37,7 @@ ISSUE_KINDS: dict[str, IssueKind] = {
         "error", "category name under two ids", "--fix joins them under the first id"
     ),
     "category-unused": IssueKind(
-        "warning", "category without an object", "leave it out with --data.classes"
+        "warning", "category without an object", "skip it with --data.classes"
     ),
     "category-gap": IssueKind(
         "note", "category ids are not 1..C", "none needed: they are remapped by name"
@@ -45,7 +46,9 @@ ISSUE_KINDS: dict[str, IssueKind] = {
         "error", "class of one split is unknown in the other", "the splits need the same categories"
     ),
     "class-only-val": IssueKind(
-        "warning", "class with objects in val and none in train", "move images, or leave it out"
+        "warning",
+        "class with objects in val and none in train",
+        "move images, or skip it with --data.classes",
     ),
     "image-broken": IssueKind("error", "image without id, file_name, width or height", _EXPORT),
     "image-id-twice": IssueKind(
@@ -55,13 +58,13 @@ ISSUE_KINDS: dict[str, IssueKind] = {
         "warning", "image file listed under two ids", "--fix joins them under the first id"
     ),
     "image-missing": IssueKind(
-        "error", "image file does not exist", "put it back; --fix leaves it out"
+        "error", "image file does not exist", "put it back; --fix removes it"
     ),
     "image-corrupt": IssueKind(
-        "error", "image file cannot be read as an image", "fetch it again; --fix leaves it out"
+        "error", "image file cannot be read as an image", "fetch it again; --fix removes it"
     ),
     "image-truncated": IssueKind(
-        "error", "image file ends early", "fetch it again; --fix leaves it out"
+        "error", "image file ends early", "fetch it again; --fix removes it"
     ),
     "image-turned": IssueKind(
         "note",
@@ -147,22 +150,22 @@ ISSUE_KINDS: dict[str, IssueKind] = {
 
 @dataclass
 class Issues:
-    """Findings of one split, counted by kind.
+    """Issues of one split, by kind.
 
     Attributes:
-        places: kind -> the images (or what else is meant) it was found in, in the order found.
+        places: kind -> the images (or other places) that have it, in the order found.
     """
 
     places: dict[str, list[str]] = field(default_factory=dict)
 
     def add(self, kind: str, where: str) -> None:
-        """One more finding. A kind that `KINDS` does not hold is a bug: KeyError."""
+        """Add one issue. A kind that `ISSUE_KINDS` does not hold is a bug: KeyError."""
         if kind not in ISSUE_KINDS:
             raise KeyError(kind)
         self.places.setdefault(kind, []).append(where)
 
     def of(self, severity: Severity) -> dict[str, list[str]]:
-        """The findings of one severity."""
+        """Return the issues of one severity."""
         return {
             kind: where
             for kind, where in self.places.items()
@@ -170,11 +173,12 @@ class Issues:
         }
 
     def lines(self) -> Iterator[str]:
-        """One line per kind, errors first: severity, count, what, three places, the mend."""
+        """Yield two lines per kind, errors first: severity, count, description, places; fix."""
         for severity in ("error", "warning", "note"):
             for kind, where in self.of(severity).items():
                 named = list(dict.fromkeys(where))
                 more = f" and {len(named) - 3} more" if len(named) > 3 else ""
                 places = ", ".join(named[:3])
-                yield f"  {severity:<8}{len(where):>6}  {ISSUE_KINDS[kind].description} [{kind}]: {places}{more}"
-                yield f"  {'':<16}mend: {ISSUE_KINDS[kind].fix}"
+                what = f"{ISSUE_KINDS[kind].description} [{kind}]"
+                yield f"  {severity:<8}{len(where):>6}  {what}: {places}{more}"
+                yield f"  {'':<16}fix: {ISSUE_KINDS[kind].fix}"

@@ -1,4 +1,4 @@
-"""One split of a COCO-format folder, row by row: findings, and the mended rows (no torch)."""
+"""Check one split of a COCO-format folder row by row, and fix its rows (no torch)."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -23,15 +23,15 @@ _CROWDED = 100  # objects
 
 @dataclass
 class SplitReport:
-    """What was seen in one split.
+    """Result of the checks of one split.
 
     Attributes:
         name: "train" or "val".
-        files: where it lies.
-        findings: what is wrong.
-        content: the mended COCO dict.
+        files: the paths of its files.
+        issues: what is wrong.
+        content: the fixed COCO dict.
         removed: rows that are not in it, each with its `why`.
-        prints: fingerprint [256] of every readable image, by file name.
+        fingerprints: fingerprint [256] of every readable image, by file name.
     """
 
     name: str
@@ -42,18 +42,20 @@ class SplitReport:
     fingerprints: dict[str, Float32Array] = field(default_factory=dict)
 
     def remove(self, why: str, row: Any) -> None:
-        """Keep a row that is left out of the mended content beside its reason."""
+        """Store a row that is not in the fixed content, with the reason."""
         self.removed.append({"why": why, "row": row})
 
     def reject(self, kind: str, where: str, row: Any) -> None:
-        """A finding for which a row has to go."""
+        """Add an issue for which a row has to be removed."""
         self.issues.add(kind, where)
         self.remove(kind, row)
 
 
 def check_split(name: str, files: SplitPaths) -> SplitReport:
-    """Look at every category, image and annotation of a split. Raises DataError when the file is
-    not COCO format.
+    """Check every category, image and annotation of a split.
+
+    Raises:
+        DataError: the file is not COCO format.
     """
     given = read_json(files.annotations)
     split = SplitReport(name, files)
@@ -83,7 +85,7 @@ def _is_row(split: SplitReport, row: Any) -> bool:
 
 
 def _categories(split: SplitReport, given: Sequence[Any]) -> tuple[list[Row], dict[int, int]]:
-    """The sound categories, and under which id each id that was given to a known name goes on."""
+    """Return the sound categories, and the first id of each name by every other id of that name."""
     kept: dict[int, Row] = {}
     first: dict[str, int] = {}
     join: dict[int, int] = {}
@@ -114,7 +116,7 @@ def _categories(split: SplitReport, given: Sequence[Any]) -> tuple[list[Row], di
 def _images(
     split: SplitReport, given: Sequence[Any], rows: Sequence[Row]
 ) -> tuple[dict[Any, Row], dict[Any, Any]]:
-    """The usable images by id, and under which id each image that is listed twice goes on."""
+    """Return the sound images by id; and the first id of a file by each other id of it."""
     by_id: dict[Any, list[Row]] = defaultdict(list)
     for row in given:
         if (
@@ -147,7 +149,7 @@ def _images(
 
 
 def _image(split: SplitReport, row: Row, annotations: Sequence[Row]) -> Row | None:
-    """One image row against its file; None when it has to go."""
+    """Compare one image row with its file; None when it has to be removed."""
     name = str(row["file_name"])
     path = split.files.images / name
     file = read_image_file(path, decode=True)
@@ -198,13 +200,13 @@ def _annotations(
     categories: set[int],
     listed: set[Any],
 ) -> list[Row]:
-    """The mended annotations. listed: ids of all images of the file, usable or not."""
+    """Return the fixed annotations. listed: ids of all images of the file, usable or not."""
     per_image: dict[Any, list[tuple[Row, dict[str, Any] | None]]] = defaultdict(list)
     for row in rows:
         image = images.get(row.get("image_id"))
         if image is None:
             if row.get("image_id") in listed:
-                split.remove("its image was left out", row)
+                split.remove("its image was removed", row)
             else:
                 split.reject("annotation-orphan", f"annotation {row.get('id')}", row)
             continue
@@ -230,7 +232,7 @@ def _annotations(
 def _without_duplicates(
     split: SplitReport, image: Row, pairs: Sequence[tuple[Row, dict[str, Any] | None]]
 ) -> list[Row]:
-    """The annotations of one image without those that repeat an earlier one of their class."""
+    """Return the annotations of an image without those that repeat one of their class."""
     duplicates: set[int] = set()
     classes: dict[Any, list[int]] = defaultdict(list)
     for i, (row, shape) in enumerate(pairs):
@@ -246,7 +248,7 @@ def _without_duplicates(
 
 
 def _numbered(split: SplitReport, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
-    """The annotations with an id each."""
+    """Return the annotations with an id each."""
     used: set[int] = set()
     following = max((row["id"] for row in rows if isinstance(row.get("id"), int)), default=0) + 1
     numbered = []
@@ -265,7 +267,7 @@ def _note_objects(
     images: dict[Any, Row],
     annotations: Sequence[Row],
 ) -> None:
-    """Findings about how many objects there are, per image and per class."""
+    """Add issues about the number of objects per image and per class."""
     per_image: dict[Any, int] = defaultdict(int)
     for row in annotations:
         per_image[row["image_id"]] += 1

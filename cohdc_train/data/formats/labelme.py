@@ -1,4 +1,4 @@
-"""labelme: one JSON per image, with shapes of several types (no torch)."""
+"""Read labelme: one JSON per image, with shapes of several types (no torch)."""
 
 import base64
 import functools
@@ -40,12 +40,14 @@ _NEEDS = {
 
 
 def read_labelme(root: Path) -> SourceDataset:
-    """A folder of images and labelme's JSON files, or one such file.
+    """Read a folder of images and labelme's JSON files, or one such file.
 
-    Polygons, rectangles, circles and masks become objects, those with the same label and `group_id`
-    one object; shapes of other types are left out and counted, and so are images without a JSON.
+    Polygons, rectangles, circles and masks become objects. Shapes of the same label and `group_id`
+    become one object. Shapes of other types and images without a JSON are skipped and counted.
     Folders named train, val and test are the source's own split.
-    Raises DataError in one line naming the file and the shape.
+
+    Raises:
+        DataError: a file cannot be used; one line names the file and the shape.
     """
     source = SourceDataset()
     for path in annotation_files(root):
@@ -56,7 +58,7 @@ def read_labelme(root: Path) -> SourceDataset:
 
 
 def _read_file(root: Path, path: Path, source: SourceDataset) -> None:
-    """Add the image of one JSON file; its objects too, unless it is of the test split."""
+    """Add the image of one JSON file, and its objects unless it is of the test split."""
     content = load_json(path)
     if not isinstance(content, dict) or not isinstance(content.get("shapes"), list):
         raise DataError(f"{path}: not labelme's: no list 'shapes'")
@@ -67,12 +69,12 @@ def _read_file(root: Path, path: Path, source: SourceDataset) -> None:
 
 
 def _image(path: Path, content: dict[str, Any]) -> SourceImage:
-    """The image beside the JSON, else the one inside it."""
+    """Return the image next to the JSON, else the one inside it."""
     size = (content.get("imageWidth"), content.get("imageHeight"))
     annotated: Any = None if None in size else size
     name = str(content.get("imagePath") or "").replace("\\", "/")
     for file in (path.parent / name, path.parent / Path(name).name):
-        if name and os.path.isfile(file):  # False for a name too long for a file
+        if name and os.path.isfile(file):  # False for a name that is too long
             return open_image(file, annotated)
     if not content.get("imageData"):
         raise DataError(f"{path}: imagePath {name!r} does not exist, and there is no imageData")
@@ -97,23 +99,20 @@ def _embedded(path: Path, content: dict[str, Any] | None = None) -> bytes:
 def _objects(
     path: Path, shapes: Sequence[Any], image: SourceImage, source: SourceDataset
 ) -> list[SourceObject]:
-    """The objects of one file, shapes of a group joined."""
+    """Return the objects of one file; shapes of a group are joined."""
     groups: dict[tuple[str, str], list[Any]] = {}
     where_of: dict[tuple[str, str], str] = {}
     for number, shape in enumerate(shapes, start=1):
         where = f"{path}: shape {number}"
-        if (
-            not isinstance(shape, dict)
-            or not isinstance(shape.get("label"), str)
-            or not shape["label"].strip()
-        ):
+        label = shape.get("label") if isinstance(shape, dict) else None
+        if not isinstance(label, str) or not label.strip():
             raise DataError(f"{where}: no label")
         part = _outline(shape, image, where)
         if part is None:
             source.skip(f"shape of type {shape['shape_type']!r}", where)
             continue
         group = shape.get("group_id")
-        key = (shape["label"].strip(), f"shape {number}" if group is None else f"group {group}")
+        key = (label.strip(), f"shape {number}" if group is None else f"group {group}")
         groups.setdefault(key, []).append(part)
         where_of.setdefault(key, where)
     return [
@@ -123,7 +122,7 @@ def _objects(
 
 
 def _outline(shape: dict[str, Any], image: SourceImage, where: str) -> Any:
-    """A polygon [x, y, ...] or an RLE; None for a shape that has no inside."""
+    """Return a polygon [x, y, ...] or an RLE; None for a shape that has no inside."""
     kind = str(shape.get("shape_type") or "polygon")
     if kind not in _NEEDS:
         return None
@@ -144,7 +143,7 @@ def _outline(shape: dict[str, Any], image: SourceImage, where: str) -> Any:
 
 
 def _mask(points: Sequence[Sequence[float]], text: str, image: SourceImage) -> dict[str, Any]:
-    """The RLE of a mask that begins at the first point; cut at the image's edge.
+    """Return the RLE of a mask that begins at the first point, cut at the image's border.
 
     labelme counts the last row and column into the box of the two points, other programs do not.
     """

@@ -21,9 +21,9 @@ def split_named(name: str) -> str:
 
 
 def split_of(root: Path, *paths: Path) -> str:
-    """Return the split after which a folder below `root` on the way to one of the paths is named.
+    """Return the split that a folder on the way to one of the paths is named after; else "".
 
-    The first such folder counts. It is "" where there is none. root: a folder, or a file in it.
+    root: a folder, or a file in it; folders above it do not count.
     """
     base = Path(os.path.abspath(root if root.is_dir() else root.parent))
     for path in paths:
@@ -38,10 +38,12 @@ def split_of(root: Path, *paths: Path) -> str:
 def settle_splits(root: Path, source: SourceDataset) -> None:
     """Keep the source's own split, or gather the images that a split is drawn from.
 
-    With images of both train and val the split is the source's own, and images of neither are left
-    out. Else a split is drawn from all images that are not of test. Those of test are left out,
-    unless val has them too. All that is left out is counted.
-    Raises DataError when there are images of test only.
+    With images of both train and val the split is the source's own, and images of neither are
+    skipped. Else a split is drawn from all images that are not of test. Images of test are skipped,
+    unless val has them, too. Everything that is skipped is counted.
+
+    Raises:
+        DataError: there are images of test only.
     """
     test = {image.path for image in source.splits.pop(TEST, [])}
     val = {image.path for image in source.splits.get("val", [])}

@@ -1,5 +1,6 @@
-"""Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them (no
-torch).
+"""Read Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them.
+
+No torch.
 """
 
 from pathlib import Path
@@ -23,8 +24,9 @@ from cohdc_train.types import Int32Array
 
 # fmt: off
 VOC_NAMES = (
-    "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow", "diningtable", "dog",
-    "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train", "tvmonitor",
+    "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow",
+    "diningtable", "dog", "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train",
+    "tvmonitor",
 )
 # fmt: on
 _BACKGROUND = frozenset(["background", "_background_"])
@@ -35,8 +37,12 @@ _MODES = (*_NUMBERS, "RGB", "RGBA")
 
 
 class ClassTable(NamedTuple):
-    """names: of class i + 1 at index i. colors: 0xRRGGBB -> class (0 background, 255 void).
-    painted: a file's.
+    """Classes of a source and their colors.
+
+    Attributes:
+        names: name of class i + 1 at index i.
+        colors: 0xRRGGBB -> class (0 background, 255 void).
+        painted: the colors come from a file.
     """
 
     names: tuple[str, ...]
@@ -45,15 +51,20 @@ class ClassTable(NamedTuple):
 
 
 def read_voc(root: Path, names: Path | None = None) -> SourceDataset:
-    """JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/ with
-    train.txt and val.txt.
+    """Read JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/.
 
-    Where there is no such split, trainval.txt or CVAT's default.txt is taken. The images of
-    test.txt are left out and counted, unless val.txt has them too. names: a file with a class per
-    line, or CVAT's labelmap.txt; without it the folder's labelmap.txt, else VOC's 20. An object's
-    class is that of most class pixels under it; 255 is void and belongs to nothing. Class ids keep
-    the order of the names.
-    Raises DataError in one line naming the file and the line.
+    Where there is no train.txt and val.txt, a split is drawn from trainval.txt or CVAT's
+    default.txt. The images of test.txt are skipped and counted, unless val.txt has them, too. An
+    object's class is that of most class pixels under it; 255 is void and belongs to nothing. Class
+    ids keep the order of the names.
+
+    Args:
+        root: the folder.
+        names: a file with a class per line, or CVAT's labelmap.txt; without it the folder's
+            labelmap.txt, else VOC's 20 classes.
+
+    Raises:
+        DataError: a file cannot be used; one line names the file and the line.
     """
     table = _class_table(
         names or (root / "labelmap.txt" if (root / "labelmap.txt").is_file() else None)
@@ -81,7 +92,7 @@ def read_voc(root: Path, names: Path | None = None) -> SourceDataset:
 
 
 def _skip_test(lists: dict[str, Path], source: SourceDataset) -> set[str]:
-    """Take the list of the test split away, count its images, and return their names."""
+    """Remove the list of the test split, count its images, and return their names."""
     listed = lists.pop(TEST, None)
     if listed is None:
         return set()
@@ -109,7 +120,7 @@ def _lists(root: Path) -> dict[str, Path]:
 
 
 def _class_table(path: Path | None) -> ClassTable:
-    """The classes of a file with a name per line, `name` or `name:R,G,B:...`; VOC's without a file."""
+    """Return the classes of a file of lines `name` or `name:R,G,B:...`; VOC's without a file."""
     rows = [(0, name) for name in VOC_NAMES] if path is None else read_lines(path)
     names: list[str] = []
     colors = {0x000000: 0, _voc_color(_VOID): _VOID}
@@ -120,11 +131,8 @@ def _class_table(path: Path | None) -> ClassTable:
             continue
         known = 0 if name in _BACKGROUND else _VOID if name in _IGNORED else len(names) + 1
         if not name or name in names:
-            raise DataError(
-                f"{path}:{number}: class {name!r} is listed twice"
-                if name
-                else f"{path}:{number}: no name"
-            )
+            fault = f"class {name!r} is listed twice" if name else "no name"
+            raise DataError(f"{path}:{number}: {fault}")
         if known == len(names) + 1:
             names.append(name)
         words = rest.partition(":")[0].split(",")
@@ -146,8 +154,9 @@ def _packed(red: int, green: int, blue: int) -> int:
 
 
 def _voc_color(index: int) -> int:
-    """VOC's color of a class: every third bit of the index goes to red, green or blue, lowest bits
-    highest.
+    """Return VOC's color of a class, 0xRRGGBB.
+
+    Every third bit of the index goes to red, green or blue, lowest bits highest.
     """
     channels = [0, 0, 0]
     for bit in range(8):
@@ -184,7 +193,7 @@ def _read_image(
 
 
 def _object_labels(path: Path) -> tuple[Int32Array, int]:
-    """[H, W] number of the object at each pixel, 0 none; and the number that means void."""
+    """Return the number of the object at each pixel, [H, W], 0: none; and the number of void."""
     with _open_png(path) as image_file:
         if image_file.mode in _NUMBERS:
             return np.asarray(image_file).astype(np.int32), _VOID
@@ -192,7 +201,7 @@ def _object_labels(path: Path) -> tuple[Int32Array, int]:
 
 
 def _class_labels(path: Path, table: ClassTable) -> Int32Array:
-    """[H, W] class at each pixel: 1..C, 0 background, 255 void."""
+    """Return the class at each pixel, [H, W]: 1..C, 0 background, 255 void."""
     with _open_png(path) as image_file:
         if image_file.mode in _NUMBERS and not (image_file.mode == "P" and table.painted):
             labels = np.asarray(image_file).astype(np.int32)
@@ -211,7 +220,7 @@ def _class_labels(path: Path, table: ClassTable) -> Int32Array:
 
 
 def _packed_colors(image_file: Image.Image) -> Int32Array:
-    """[H, W] 0xRRGGBB."""
+    """Return the color at each pixel, [H, W], 0xRRGGBB."""
     rgb = np.asarray(image_file.convert("RGB")).astype(np.int32)
     packed: Int32Array = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
     return packed
