@@ -1,5 +1,6 @@
-"""Things that people use: a chair to sit on, a loaded cart to push. Own frame as a person's: x
-forward, z up, m.
+"""Furniture that people use: a chair, and a loaded cart to push.
+
+Own frame as a person's: x forward, z up, m.
 """
 
 import numpy as np
@@ -20,7 +21,7 @@ _UPRIGHT = (0.0, 1.0, 0.0)
 
 
 def chair(seat: float) -> Mesh:
-    """A chair whose seat is `seat` m above the floor, its only texture number 0."""
+    """Return a chair whose seat is `seat` m above the floor; its only texture is number 0."""
     parts = [
         solids.box((0.12, 0, seat - 0.02), (0.44, 0.46, 0.04), 0, 0, 0),
         solids.box((-0.17, 0, seat + 0.33), (0.03, 0.44, 0.3), 0, 0, 0),
@@ -32,14 +33,12 @@ def chair(seat: float) -> Mesh:
 
 
 def chair_texture(rng: np.random.Generator) -> Texture:
-    """What a chair is made of."""
+    """Draw the texture of a chair."""
     return wood_texture(rng, _SIDE, _SIDE)
 
 
 def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
-    """A cart of 1 x .6 m with a handle at its back, loaded to a height of 1.2-1.5 m, and its
-    textures.
-    """
+    """Draw a cart of 1 x .6 m with a handle at its back, loaded to 1.2-1.5 m, and its textures."""
     looks = (
         _metal(rng),
         carton_texture(rng, _SIDE, _SIDE),
@@ -72,7 +71,7 @@ def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
 
 
 def _metal(rng: np.random.Generator) -> Texture:
-    """Painted metal with a label."""
+    """Draw painted metal with a label."""
     image = np.full((_SIDE, _SIDE, 3), rng.uniform(60, 190), dtype=np.float32)
     write_letters(image, rng, 2)
     return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)

@@ -21,11 +21,16 @@ _THIGH, _SHANK, _UPPER_ARM, _FOREARM = 0.245, 0.245, 0.17, 0.15  # as parts of t
 
 @dataclass(frozen=True)
 class Person:
-    """A body and what it wears.
+    """A body and its clothes.
 
-    height: m; girth: 1 = slim adult; bare_arms, legwear (`trousers | shorts | skirt`), hairstyle
-    (`short | long | none`), coat: length the shirt hangs below the waist, as part of the height;
-    textures: six, in the order SHIRT TROUSERS SKIN FACE HAIR SHOES.
+    Attributes:
+        height: m.
+        girth: 1 = slim adult.
+        bare_arms: the shirt has short sleeves.
+        legwear: `trousers`, `shorts` or `skirt`.
+        hairstyle: `short`, `long` or `none`.
+        coat: length the shirt hangs below the waist, as part of the height.
+        textures: six, in the order SHIRT TROUSERS SKIN FACE HAIR SHOES.
     """
 
     height: float
@@ -51,7 +56,7 @@ class BodyPose:
 
 
 def draw_person(rng: np.random.Generator, patterned: float = 0.6) -> Person:
-    """A random adult or teenager with clothes; `patterned` is the chance of a shirt with a pattern."""
+    """Draw an adult or teenager with clothes. patterned: probability of a pattern."""
     tone, hair = clothes.skin_tone(rng), clothes.hair_color(rng)
     looks = (
         clothes.cloth(rng, patterned),
@@ -73,12 +78,12 @@ def draw_person(rng: np.random.Generator, patterned: float = 0.6) -> Person:
 
 
 def stride(person: Person) -> float:
-    """Meters walked in one cycle of two steps."""
+    """Return the meters walked in one cycle of two steps."""
     return 0.8 * person.height
 
 
 def walking(phase: float, vigor: float = 1.0) -> BodyPose:
-    """The walk cycle at `phase` rad (2 pi = two steps); vigor 0 stands still, 1 walks."""
+    """Return the pose at `phase` rad of the walk cycle (2 pi = two steps); vigor 0 stands, 1 walks."""
     s, c = np.sin(phase), np.cos(phase)
     swing = 0.46 * vigor
     lift = 0.85 * vigor
@@ -94,8 +99,11 @@ def walking(phase: float, vigor: float = 1.0) -> BodyPose:
 
 
 def sitting(fidget: float, gesture: float) -> BodyPose:
-    """Seated, a hand on each thigh; fidget -1..1 sways trunk and head a little, gesture 0..1 lifts
-    the right hand.
+    """Return a seated pose with a hand on each thigh.
+
+    Args:
+        fidget: -1..1, sways trunk and head a little.
+        gesture: 0..1, lifts the right hand.
     """
     return BodyPose(
         hips=(1.45, 1.5),
@@ -109,7 +117,7 @@ def sitting(fidget: float, gesture: float) -> BodyPose:
 
 
 def seat_height(person: Person, pose: BodyPose) -> float:
-    """Height above the floor of what a seated person's thighs rest on, m."""
+    """Return the height above the floor at which a seated person's thighs rest, m."""
     soles = [
         _leg(person, side, hip, knee)[1]
         for side, hip, knee in zip((1, -1), pose.hips, pose.knees, strict=True)
@@ -118,7 +126,7 @@ def seat_height(person: Person, pose: BodyPose) -> float:
 
 
 def draw_pose(rng: np.random.Generator) -> BodyPose:
-    """A random moment: half of them walking, the others standing, gesturing or reaching."""
+    """Draw a pose: half of them walk, the others stand, gesture or reach."""
     kind = rng.random()
     pose = walking(
         float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.5, 1.2)) if kind < 0.55 else 0.1
@@ -142,7 +150,12 @@ def draw_pose(rng: np.random.Generator) -> BodyPose:
 
 
 def _direction(swing: float, spread: float) -> Float32Array:
-    """[3] where a limb points: `swing` forward of straight down, `spread` (signed) towards y."""
+    """Return the direction of a limb, [3].
+
+    Args:
+        swing: forward of straight down, rad.
+        spread: towards y, rad, signed.
+    """
     return np.array(
         [np.sin(swing) * np.cos(spread), np.sin(spread), -np.cos(swing) * np.cos(spread)],
         dtype=np.float32,
@@ -152,10 +165,15 @@ def _direction(swing: float, spread: float) -> Float32Array:
 def person_mesh(
     person: Person, pose: BodyPose, position: tuple[float, float], heading: float
 ) -> Mesh:
-    """The person standing on the floor at `position` (x, y) m, looking along `heading` rad, as
-    instance 0.
+    """Return the person standing on the floor, as instance 0.
 
     Texture numbers are 0..5 in the order of `Person.textures`.
+
+    Args:
+        person: the body.
+        pose: joint angles.
+        position: (x, y), m.
+        heading: viewing direction, rad.
     """
     parts: list[Mesh] = []
     lowest = 0.0
@@ -174,7 +192,7 @@ def person_mesh(
 
 
 def _leg(person: Person, side: int, hip: float, knee: float) -> tuple[list[Mesh], float]:
-    """Thigh, shank and foot below hips at z = 0, and the z of the sole."""
+    """Return thigh, shank and foot below hips at z = 0, and the z of the sole."""
     h, g = person.height, person.height * person.girth
     top = np.array([0, side * 0.052 * g, 0], dtype=np.float32)
     middle = top + _THIGH * h * _direction(hip, side * 0.03)
@@ -201,7 +219,7 @@ def _leg(person: Person, side: int, hip: float, knee: float) -> tuple[list[Mesh]
 
 
 def _trunk(person: Person, pose: BodyPose, spine: Float32Array) -> list[Mesh]:
-    """Pelvis (or skirt), chest up to the neck."""
+    """Return the pelvis (or skirt), and the chest up to the neck."""
     h, g = person.height, person.height * person.girth
     up = np.array([0, 0, 1], dtype=np.float32)
     belly = 1 + 1.2 * (person.girth - 1)
@@ -235,7 +253,7 @@ def _trunk(person: Person, pose: BodyPose, spine: Float32Array) -> list[Mesh]:
 
 
 def _head(person: Person, pose: BodyPose, spine: Float32Array) -> list[Mesh]:
-    """Neck, head with its face forward, hair."""
+    """Return the neck, the head with its face forward, and the hair."""
     h = person.height
     neck = 0.305 * h * spine
     tilt = np.array(
@@ -259,7 +277,7 @@ def _head(person: Person, pose: BodyPose, spine: Float32Array) -> list[Mesh]:
 def _arm(
     person: Person, spine: Float32Array, side: int, angles: tuple[float, float, float]
 ) -> list[Mesh]:
-    """Upper arm, forearm and hand; angles: (swing, bend, spread)."""
+    """Return upper arm, forearm and hand. angles: (swing, bend, spread), rad."""
     h, g = person.height, person.height * person.girth
     swing, bend, spread = angles
     shoulder = 0.272 * h * spine + np.array([0, side * 0.108 * g, 0], dtype=np.float32)

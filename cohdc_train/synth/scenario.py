@@ -1,4 +1,4 @@
-"""What a sequence shows: room, camera path, and what everybody does, drawn from a seed."""
+"""Draw a scene from a seed: room, camera path, and the actions of all actors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,19 +21,20 @@ from cohdc_train.synth.camera_motion import (
 from cohdc_train.synth.mesh import join
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, RenderCamera, RenderedView, render
-from cohdc_train.synth.room import Room, furnished_room, loop_room, plain_room, texture_detail
+from cohdc_train.synth.room import Room
+from cohdc_train.synth.room_layouts import furnished_room, loop_room, plain_room, texture_detail
 from cohdc_train.synth.walk_paths import Walk
 from cohdc_train.types import FloatArray
 
 Action = Literal["walk", "stop_and_go", "fill_view", "sit"]
 RATE = 30.0  # frames per second
-TRUTH_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own stamp
+POSES_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own timestamp
 SHARE = (0.26, 0.38)  # mean share of the pixels on people and cart that a scene is drawn for
-CROWD, CROWD_SHARE = 6, (0.36, 0.52)  # more people than this are a crowd, which covers more
+CROWD, CROWD_SHARE = 6, (0.36, 0.52)  # more people are a crowd, which covers more
 PEAK = 0.62  # share that no frame should exceed
-EMPTY = 0.2  # share of the frames that may show next to nobody
-_COARSE_BIAS = 0.87  # exact over coarse share: pixels touched by a point count as whole ones
-_MAX_DRAWS = 24  # how often the ways are drawn anew to get there
+EMPTY = 0.2  # share of the frames that may show nearly no actor
+_COARSE_BIAS = 0.87  # exact share over coarse share, where each point fills a whole pixel
+_MAX_DRAWS = 24  # of the paths, to reach these shares
 # m beyond the view's border where people turn
 _TURN_MARGIN = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}
 _EYE_Y = 0.9  # m from the wall behind the camera
@@ -41,15 +42,15 @@ _EYE_Y = 0.9  # m from the wall behind the camera
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """What happens in the room.
+    """Events in the room.
 
     Args:
         action: of the people. walk: they cross the view again and again; stop_and_go: they stand
             still for seconds, then walk on; fill_view: one comes up to the camera and fills its
-            view for a while, the others walk; sit: they sit and fidget a little.
-        cart: a loaded cart that rolls to and fro across the view, by itself or pushed by the first
+            view for a while, the others walk; sit: they sit and move a little.
+        cart: a loaded cart that moves back and forth across the view, alone or pushed by the first
             of the people.
-        walls: textured and hung with pictures, or plain.
+        walls: textured and hung with posters, or plain.
     """
 
     action: Action = "walk"
@@ -74,10 +75,14 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """Everything a sequence shows, as functions of the frame number.
+    """Everything that a sequence shows, as functions of the frame number.
 
-    truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own; metered:
-    frames whose brightness sets the exposure of all.
+    Attributes:
+        room: walls and furniture.
+        actors: people and movable objects.
+        camera: intrinsics.
+        groundtruth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own.
+        metered: frames whose brightness sets the exposure of all.
     """
 
     room: Room
@@ -88,17 +93,17 @@ class RenderedScene:
 
     @property
     def poses(self) -> FloatArray:
-        """[n, 4, 4] T_wc of the frames, m."""
-        return self.groundtruth[::TRUTH_PER_FRAME]
+        """Camera poses of the frames, [n, 4, 4] T_wc, m."""
+        return self.groundtruth[::POSES_PER_FRAME]
 
     def atlas(self) -> Atlas:
-        """The textures of room and actors."""
+        """Return the textures of room and actors."""
         return Atlas(
             [*self.room.textures, *(look for actor in self.actors for look in actor.textures)]
         )
 
     def view(self, frame: int, atlas: Atlas) -> RenderedView:
-        """The frame as a perfect camera sees it, the actors as instances 1.. in their order."""
+        """Render a frame as a perfect camera sees it; actors are instances 1.. in their order."""
         meshes, first = [self.room.mesh], len(self.room.textures)
         for k, actor in enumerate(self.actors):
             meshes.append(actor.mesh(frame).named(k + 1, first))
@@ -108,7 +113,14 @@ class RenderedScene:
 
 @dataclass(frozen=True)
 class _ActorFactory:
-    """What ways are drawn from. times [n] s and poses [n, 4, 4] T_wc of the frames."""
+    """Draws actors and their paths.
+
+    Attributes:
+        rng: random numbers.
+        times: [n] s, of the frames.
+        poses: [n, 4, 4] T_wc of the frames, m.
+        motion: of the camera.
+    """
 
     rng: np.random.Generator
     times: FloatArray
@@ -116,7 +128,7 @@ class _ActorFactory:
     motion: CameraMotion
 
     def crowd(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """People who cross the view; in a loop they lead the camera round."""
+        """Return people who cross the view; in a loop they walk round with the camera."""
         if not people:
             return []
         ways = walks.crowd(self.rng, self.times, distances, _TURN_MARGIN[self.motion])
@@ -129,7 +141,7 @@ class _ActorFactory:
         return [Walker(person, way) for person, way in zip(people, ways, strict=True)]
 
     def stopping(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """People who stop and go."""
+        """Return people who stop and go."""
         ways = walks.stop_and_go(self.rng, self.times, distances)
         return [
             Walker(person, way.transformed(0.0, _EYE_Y))
@@ -137,14 +149,14 @@ class _ActorFactory:
         ]
 
     def filling(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """One before the camera, the others cross behind."""
+        """Return one person before the camera, and others who cross behind."""
         first = [
             Walker(person, walks.approach_camera(self.times, self.poses)) for person in people[:1]
         ]
         return [*first, *self.crowd(people[1:], distances[1:] + 0.6)]
 
     def seated(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """People side by side on chairs, turned to the camera more or less."""
+        """Return people on chairs side by side, more or less turned to the camera; then chairs."""
         sitters: list[Actor] = []
         chairs: list[Actor] = []
         still = np.zeros(len(self.times))
@@ -163,7 +175,7 @@ class _ActorFactory:
         return [*sitters, *chairs]
 
     def rolling(self, pusher: list[bodies.Person], distance: float) -> list[Actor]:
-        """A cart, and who pushes it."""
+        """Return a cart, and the person who pushes it."""
         body, looks = furniture.cart(self.rng)
         line = walks.back_and_forth(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
         way, behind = walks.cart_path(self.rng, self.times, line, furniture.HANDLE - 0.5)
@@ -182,18 +194,23 @@ def draw_scene(
     people: int,
     setting: SceneConfig | None = None,
 ) -> RenderedScene:
-    """Draw the room, the camera's path and the ways, so that what moves covers 20-40 % of the
-    pixels on average.
+    """Draw the room, the camera path and the actors, who cover 20-40 % of the pixels on average.
 
-    size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of
-    them fits SHARE (a
-    crowd: CROWD_SHARE), PEAK and EMPTY; the best is taken. Whoever fills the view is left out of
-    that.
+    Paths are drawn again, nearer or farther, until a coarse rendering of them fits SHARE (a crowd:
+    CROWD_SHARE), PEAK and EMPTY; the best is taken. A person who fills the view does not count
+    there.
+
+    Args:
+        seed: of all random numbers.
+        frames: number of frames.
+        size: (height, width), px.
+        motion: of the camera.
+        people: number of people.
+        setting: events in the room.
     """
     setting = setting or SceneConfig()
-    rng = stream(
-        seed, "sequence", 1
-    )  # apart from the room's, whose draws depend on the size of its textures
+    # apart from the room's stream, whose draws depend on the size of its textures
+    rng = stream(seed, "sequence", 1)
     length, height = float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8))
     room = _room(
         seed,
@@ -202,14 +219,14 @@ def draw_scene(
         motion,
         setting,
     )
-    fine = np.arange(TRUTH_PER_FRAME * (frames - 1) + 1) / (RATE * TRUTH_PER_FRAME)
+    fine = np.arange(POSES_PER_FRAME * (frames - 1) + 1) / (RATE * POSES_PER_FRAME)
     middle = room.size[1] / 2 if motion == "loop" else _EYE_Y
     truth = camera_path(rng, fine, motion, np.array([0.0, middle, rng.uniform(1.25, 1.5)]))
     cast = [bodies.draw_person(rng, patterned=1.0) for _ in range(people)]
-    factory = _ActorFactory(rng, fine[::TRUTH_PER_FRAME], truth[::TRUTH_PER_FRAME], motion)
-    nobody = people == 0 and setting.cart == "none"
+    factory = _ActorFactory(rng, fine[::POSES_PER_FRAME], truth[::POSES_PER_FRAME], motion)
+    is_empty = people == 0 and setting.cart == "none"
     metered = tuple(k * frames // 5 for k in range(5)) if motion == "loop" else (0,)
-    fitted = not nobody and setting.action != "fill_view"
+    is_fitted = not is_empty and setting.action != "fill_view"
 
     def draw(nearest: float) -> RenderedScene:
         return RenderedScene(
@@ -220,7 +237,7 @@ def draw_scene(
             metered,
         )
 
-    return _best_scene(draw, people) if fitted else draw(1.3)
+    return _best_scene(draw, people) if is_fitted else draw(1.3)
 
 
 def _room(
@@ -243,7 +260,7 @@ def _room(
 def _actors(
     factory: _ActorFactory, setting: SceneConfig, cast: list[bodies.Person], nearest: float
 ) -> tuple[Actor, ...]:
-    """Everybody, the nearest `nearest` m from the eye: people first, things last."""
+    """Return all actors, the nearest `nearest` m from the eye: people first, objects last."""
     pushers = 1 if setting.cart == "pushed" else 0
     others = cast[pushers:]
     distances = nearest + min(0.35, 2.0 / max(len(others) - 1, 1)) * np.arange(
@@ -263,28 +280,28 @@ def _actors(
 
 
 def _best_scene(draw: Callable[[float], RenderedScene], people: int) -> RenderedScene:
-    """The best of some draws at distances that approach the wanted share."""
+    """Return the best of some draws at distances that approach the wanted share."""
     wanted, peak_wanted = (CROWD_SHARE, 0.8) if people > CROWD else (SHARE, PEAK)
     nearest = 1.3
-    best: tuple[float, RenderedScene] | None = None
+    candidates: list[tuple[float, RenderedScene]] = []
     for _ in range(_MAX_DRAWS):
         scene = draw(nearest)
         shares = _coarse_coverage(scene)
-        mean, peak, empty = float(shares.mean()), float(shares.max()), float(np.mean(shares < 0.05))
+        mean, peak = float(shares.mean()), float(shares.max())
+        empty = float(np.mean(shares < 0.05))
         off = max(wanted[0] - mean, mean - wanted[1], 0.0)
         cost = off + 0.5 * max(peak - peak_wanted, 0.0) + 0.5 * max(empty - EMPTY, 0.0)
-        if best is None or cost < best[0]:
-            best = (cost, scene)
+        candidates.append((cost, scene))
         if cost == 0:
             break
         nearer = np.sqrt(max(mean, 0.02) / np.mean(wanted)) if peak <= peak_wanted else 1.05
         nearest = float(np.clip(nearest * nearer, 0.8 + 0.1 * min(people, CROWD), 1.6))
-    assert best is not None
-    return best[1]
+    _, best = min(candidates, key=lambda candidate: candidate[0])
+    return best
 
 
 def _coarse_coverage(scene: RenderedScene) -> FloatArray:
-    """About the share of the pixels on actors in every sixth frame, from their points on 64 px."""
+    """Return the approximate share of pixels on actors in every sixth frame, at 64 px."""
     camera = scene.camera.resized(64 / scene.camera.width)
     shares = []
     for k in range(0, len(scene.poses), 6):

@@ -1,4 +1,4 @@
-"""`cohdc synth sequence`: an RGB-D sequence of people in a room, in TUM's layout, with its truth."""
+"""Render an RGB-D sequence of people in a room, in TUM's layout: `cohdc synth sequence`."""
 
 import json
 from dataclasses import asdict
@@ -16,12 +16,12 @@ from cohdc_train.synth.camera_motion import MOTIONS, CameraMotion
 from cohdc_train.synth.option_checks import check_size_and_seed
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import RenderCamera
-from cohdc_train.synth.scenario import RATE, TRUTH_PER_FRAME, RenderedScene, SceneConfig, draw_scene
+from cohdc_train.synth.scenario import POSES_PER_FRAME, RATE, RenderedScene, SceneConfig, draw_scene
 from cohdc_train.synth.sensor import DEPTH_SCALE, add_sensor_noise, exposure_gain, measure_depth
 from cohdc_train.types import FloatArray
 
 FIRST_TIMESTAMP = 1305031102.175304  # s
-MIN_MOVING_SPEED = 0.05  # m/s: an actor none of whose points is faster stands still
+MIN_MOVING_SPEED = 0.05  # m/s, of the fastest point of an actor that moves
 MAX_PEOPLE = 12
 
 
@@ -32,14 +32,13 @@ def sequence(
     seed: int = 0,
     motion: CameraMotion = "xyz",
     people: int = 3,
-    scene: SceneConfig = SceneConfig(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
+    scene: SceneConfig = SceneConfig(),  # noqa: B008 - frozen; jsonargparse reads its defaults
 ) -> None:
-    """Render an RGB-D sequence with people in TUM's layout (rgb/, depth/, rgb.txt, depth.txt,
-    groundtruth.txt).
+    """Render an RGB-D sequence with people in TUM's layout.
 
-    Beside TUM's files: masks/ (255 = person), movers/ (255 = whoever and whatever moves in this
-    frame: not a person who stands or sits still, but a cart that rolls), camera.yaml, info.json
-    (share of person pixels per frame).
+    Writes rgb/, depth/, rgb.txt, depth.txt and groundtruth.txt, and further masks/ (255 = person),
+    movers/ (255 = moves in this frame: not a person who stands or sits still, but a cart that
+    rolls), camera.yaml and info.json (share of person pixels per frame).
 
     Args:
         out: new or empty folder.
@@ -49,14 +48,15 @@ def sequence(
         motion: camera motion as in TUM's walking sequences; loop: once round the room (give it 300
             frames and more).
         people: how many there are, 0 to 12; more than 6 are a crowd.
-        scene: what happens in the room.
+        scene: events in the room.
     """
     _check(frames, size, seed, motion, people)
     scene.check(motion, people)
     drawn = draw_scene(seed, frames, size, motion, people, scene)
     with new_folder(out) as draft:
         shares, moving = _write_frames(draft, drawn, seed)
-        title = f"synthetic_{'walking' if scene.action == 'walk' else scene.action}_{motion}, seed {seed}"
+        action = "walking" if scene.action == "walk" else scene.action
+        title = f"synthetic_{action}_{motion}, seed {seed}"
         _write_lists(draft, frames, title)
         _write_groundtruth(draft / "groundtruth.txt", drawn.groundtruth, title)
         _write_camera(draft / "camera.yaml", drawn.camera)
@@ -91,14 +91,12 @@ def _check(frames: int, size: tuple[int, int], seed: int, motion: str, people: i
 
 
 def timestamps(frames: int) -> list[str]:
-    """The frames' time stamps as TUM writes them: seconds with six decimals."""
+    """Return the timestamps of the frames as TUM writes them: seconds with six decimals."""
     return [f"{FIRST_TIMESTAMP + k / RATE:.6f}" for k in range(frames)]
 
 
 def _write_frames(folder: Path, scene: RenderedScene, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Write rgb/, depth/, masks/ and movers/; returns the shares of person pixels and of moving
-    ones per frame.
-    """
+    """Write rgb/, depth/, masks/ and movers/, and return the shares of person and moving pixels."""
     for name in ("rgb", "depth", "masks", "movers"):
         (folder / name).mkdir()
     rng = stream(seed, "sequence", 2)
@@ -139,14 +137,14 @@ def _write_lists(folder: Path, frames: int, title: str) -> None:
 
 
 def _write_groundtruth(path: Path, truth: FloatArray, title: str) -> None:
-    """T_wc as `stamp tx ty tz qx qy qz qw`, m, at 90 Hz."""
+    """Write T_wc as `timestamp tx ty tz qx qy qz qw`, m, at 90 Hz."""
     from scipy.spatial.transform import Rotation
 
     quaternions = Rotation.from_matrix(truth[:, :3, :3]).as_quat()
     lines = ["# ground truth trajectory", f"# file: '{title}'", "# timestamp tx ty tz qx qy qz qw"]
     for k, (position, quaternion) in enumerate(zip(truth[:, :3, 3], quaternions, strict=True)):
         numbers = " ".join(f"{v:.7f}" for v in (*position, *quaternion))
-        lines.append(f"{FIRST_TIMESTAMP + k / (RATE * TRUTH_PER_FRAME):.6f} {numbers}")
+        lines.append(f"{FIRST_TIMESTAMP + k / (RATE * POSES_PER_FRAME):.6f} {numbers}")
     path.write_text("\n".join(lines) + "\n")
 
 

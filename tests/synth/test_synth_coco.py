@@ -75,7 +75,7 @@ def test_small_parts_of_people_are_annotated_as_crowd() -> None:
 
 def test_annotations_are_the_rendered_masks(folder: Path) -> None:
     rng = stream(5, "coco-train", 0)
-    from cohdc_train.synth.room import texture_detail
+    from cohdc_train.synth.room_layouts import texture_detail
 
     room_with_people = draw_populated_room(rng, texture_detail(SIZE))
     api = pycocotools.COCO(folder / "instances_train.json")
