@@ -34,15 +34,17 @@ def test_draw_outline_follows_mask_and_its_hole() -> None:
     image = gray_image()
     draw_outline(image, ring_mask(), RED)
     is_red = (image == RED).all(axis=2)
-    assert is_red[10, 10:30].all() and is_red[29, 10:30].all()
+    assert is_red[10, 10:30].all()
+    assert is_red[29, 10:30].all()
     assert is_red[17, 18:22].all()
     assert not is_red[13:16, 13:27].any()
 
 
 def test_write_text_draws_white_letters_with_black_rim() -> None:
     image = gray_image()
-    write_text(image, "a1", (5, 30))
-    assert image.min() == 0 and image.max() == 255
+    write_text(image, "H1", (5, 30), scale=1.0)
+    assert image.min() < 20
+    assert image.max() > 235
 
 
 def test_jpeg_keeps_order_of_color_channels() -> None:

@@ -11,7 +11,7 @@ from pycocotools import mask as rle
 from cohdc_train.bench.networks import NetworkBenchOptions
 from cohdc_train.bench.speed import MIN_SCORE
 from cohdc_train.bench.training import train
-from cohdc_train.contour import simplify, trace, vertices
+from cohdc_train.contour import count_vertices, simplify, trace
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.exporter.export import export
@@ -162,5 +162,5 @@ def mean_vertices(results: Results) -> float:
     likely = [row for row in results.rows if row["score"] >= MIN_SCORE]
     masks = [rle.decode(row["segmentation"]).astype(np.bool_) for row in likely]
     polygons = [simplify(trace(mask), _MIN_POLYGON_IOU, "bas_dp") for mask in masks if mask.any()]
-    counts = [vertices(polygon) for polygon in polygons]
+    counts = [count_vertices(polygon) for polygon in polygons]
     return float(np.mean(counts)) if counts else float("nan")

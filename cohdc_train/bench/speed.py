@@ -26,7 +26,6 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.types import Image
 run = Segmenter(Path(sys.argv[1]), int(sys.argv[2]))
 image = np.load(sys.argv[3])
 for _ in range(3):

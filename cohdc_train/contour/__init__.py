@@ -2,23 +2,30 @@
 floor of IoU.
 
 Points are (x, y) in px with the origin at the corner of the first pixel, as COCO has them: pixel
-(i, j) is the square from (j, i) to (j + 1, i + 1) and belongs to a polygon when its centre does
+(i, j) is the square from (j, i) to (j + 1, i + 1) and belongs to a polygon when its center does
 (even-odd rule over all rings).
 """
 
 from cohdc_train.contour.beetle_search import BeetleSearch
-from cohdc_train.contour.polygons import Polygon, joined, pixel_borders, rasterize, trace, vertices
-from cohdc_train.contour.simplification import METHODS, Method, simplify
+from cohdc_train.contour.polygons import (
+    Polygon,
+    count_vertices,
+    join_polygons,
+    pixel_borders,
+    rasterize,
+    trace,
+)
+from cohdc_train.contour.simplification import METHODS, ContourMethod, simplify
 
 __all__ = [
     "METHODS",
     "BeetleSearch",
-    "Method",
+    "ContourMethod",
     "Polygon",
-    "joined",
+    "join_polygons",
     "pixel_borders",
     "rasterize",
     "simplify",
     "trace",
-    "vertices",
+    "count_vertices",
 ]

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cohdc_train.contour.polygon_iou import Coverage
-from cohdc_train.contour.polygons import Polygon, vertices
+from cohdc_train.contour.polygon_iou import IoUEvaluator
+from cohdc_train.contour.polygons import Polygon, count_vertices
 from cohdc_train.types import FloatArray, IntArray
 
-_MOST_VERTICES = 2000  # behind bisection; an outline of more is kept as it is
+_MAX_VERTICES = 2000  # behind bisection; an outline of more is kept as it is
 _AT_A_TIME = 8  # at first, of so many vertices one is dropped
 _LONG = 6  # vertices of a ring of which at least three are left when every other one is dropped
 _DENSE = 10  # of an outline with many vertices one of so many is tried before the search ends
@@ -51,7 +51,7 @@ class BeetleSearch:
 
 
 def search_vertices(
-    finer: list[Polygon], iou_floor: float, coverage: Coverage, search: BeetleSearch
+    finer: list[Polygon], iou_floor: float, evaluator: IoUEvaluator, search: BeetleSearch
 ) -> list[Polygon]:
     """Drop vertices and move the others while the floor is kept.
 
@@ -62,43 +62,45 @@ def search_vertices(
     finer: polygons that keep the floor. Returns the last ones that keep it and do not cross
     themselves.
     """
-    if vertices(finer) > _MOST_VERTICES:
+    if count_vertices(finer) > _MAX_VERTICES:
         return finer
     rng = np.random.default_rng(search.seed)
-    beetles, moved = _Beetles(finer, coverage, search.pairs), False
+    swarm, moved = _VertexSwarm(finer, evaluator, search.pairs), False
 
-    def without_one_of(choices: Iterable[tuple[IntArray, int]]) -> "_Beetles | None":
+    def without_one_of(choices: Iterable[tuple[IntArray, int]]) -> "_VertexSwarm | None":
         for dropped, added in choices:
-            fewer = beetles.without(dropped, added)
-            if fewer.settle(iou_floor, search, rng) and coverage.valid(fewer.polygons()):
+            fewer = swarm.without(dropped, added)
+            if fewer.move_until_valid(iou_floor, search, rng) and evaluator.is_valid(
+                fewer.polygons()
+            ):
                 return fewer
         return None
 
-    while (count := beetles.count // _AT_A_TIME) > 1 and (
-        fewer := without_one_of(beetles.missed_together(count))
+    while (count := swarm.count // _AT_A_TIME) > 1 and (
+        fewer := without_one_of(swarm.joint_removals(count))
     ):
-        beetles = fewer
+        swarm = fewer
     while True:
-        tries = 1 if moved else max(search.tries, beetles.count // _DENSE)
-        if fewer := without_one_of(beetles.least_missed(tries)):
-            beetles, moved = fewer, False
+        tries = 1 if moved else max(search.tries, swarm.count // _DENSE)
+        if fewer := without_one_of(swarm.cheapest_removals(tries)):
+            swarm, moved = fewer, False
             continue
-        better = beetles if moved else beetles.moved(search, rng)
-        if moved or better.iou() < beetles.iou() or not coverage.valid(better.polygons()):
-            return beetles.polygons()
-        beetles, moved = better, True
+        better = swarm if moved else swarm.moved(search, rng)
+        if moved or better.iou() < swarm.iou() or not evaluator.is_valid(better.polygons()):
+            return swarm.polygons()
+        swarm, moved = better, True
 
 
-class _Beetles:
+class _VertexSwarm:
     """The vertices of all rings, each the head of a beetle.
 
     A beetle's f is what its two edges add to the pixels that only one of outline and polygons has.
-    Neighbours do not move at the same time, so that the sum falls by what each of them gains.
+    Neighbors do not move at the same time, so that the sum falls by what each of them gains.
     """
 
-    def __init__(self, polygons: list[Polygon], coverage: Coverage, pairs: int) -> None:
+    def __init__(self, polygons: list[Polygon], evaluator: IoUEvaluator, pairs: int) -> None:
         rings = [ring for polygon in polygons for ring in polygon.rings]
-        self._coverage = coverage
+        self._evaluator = evaluator
         self._spread = np.arange(pairs)[:, None] * np.pi / pairs
         self._owner = np.array(
             [k for k, polygon in enumerate(polygons) for _ in polygon.rings]
@@ -106,10 +108,10 @@ class _Beetles:
         self._sizes = np.array([len(ring) for ring in rings])
         self._x = np.concatenate(rings)  # [V, 2]
         self._link()
-        _, self._apart = coverage.counts(*self._edges())
+        _, self._apart = evaluator.count_pixels(*self._edges())
 
     def _link(self) -> None:
-        """Neighbours of every vertex, its place in its ring and the ring's size."""
+        """Neighbors of every vertex, its place in its ring and the ring's size."""
         ends = np.cumsum(self._sizes)
         starts = ends - self._sizes
         index = np.arange(len(self._x))
@@ -127,7 +129,7 @@ class _Beetles:
         return self._x, self._x.take(self._after, axis=0)
 
     def _turns(self, first: int) -> list[IntArray]:
-        """Two sets without neighbours among them; of an odd ring one vertex is in none, another for
+        """Two sets without neighbors among them; of an odd ring one vertex is in none, another for
         every `first`.
         """
         place = (self._place + first) % self._size
@@ -140,9 +142,9 @@ class _Beetles:
         start[0] = self._x.take(self._before.take(index), axis=0)
         start[1] = self._x.take(self._after.take(index), axis=0)
         end[:] = heads
-        added = self._coverage.difference(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(
-            2, *heads.shape[:2]
-        )
+        added = self._evaluator.count_added_pixels(
+            start.reshape(-1, 2), end.reshape(-1, 2)
+        ).reshape(2, *heads.shape[:2])
         f: IntArray = added[0] - added[1]
         return f
 
@@ -165,7 +167,7 @@ class _Beetles:
         places[:] = self._x
         places[1 : 1 + pairs] += whisker * b
         places[1 + pairs :] -= whisker * b
-        places[1:] = self._coverage.nearest(places[1:])
+        places[1:] = self._evaluator.snap_to_grid(places[1:])
         for index in self._turns(first):
             felt, every = places.take(index, axis=1), np.arange(len(index))
             f = self._f(index, felt)
@@ -173,17 +175,19 @@ class _Beetles:
                 left, right = f[1 : 1 + pairs], f[1 + pairs :]
                 best = np.minimum(left, right).argmin(0)
                 towards = b[best, index] * np.sign(left - right)[best, every][:, None]
-                moved = self._coverage.nearest(self._x[index] - step * towards)[None]
+                moved = self._evaluator.snap_to_grid(self._x[index] - step * towards)[None]
                 felt, f = np.concatenate([felt, moved]), np.concatenate([f, self._f(index, moved)])
             best = f.argmin(0)
             self._apart += int((f[best, every] - f[0]).sum())
             self._x[index] = felt[best, every]
 
-    def settle(self, iou_floor: float, search: BeetleSearch, rng: np.random.Generator) -> bool:
+    def move_until_valid(
+        self, iou_floor: float, search: BeetleSearch, rng: np.random.Generator
+    ) -> bool:
         """Move until the floor is kept; False when it is not after n moves, or will not be as far
         as one can tell.
         """
-        ious = [self.iou_about()]
+        ious = [self.approximate_iou()]
         for k, step in enumerate(search.steps):
             if ious[-1] >= iou_floor and self.iou() >= iou_floor:
                 return True
@@ -192,10 +196,10 @@ class _Beetles:
             ):  # moves to come are worth less than the last two
                 return False
             self.move(step, step / search.c, k, rng)
-            ious.append(self.iou_about())
+            ious.append(self.approximate_iou())
         return ious[-1] >= iou_floor and self.iou() >= iou_floor
 
-    def moved(self, search: BeetleSearch, rng: np.random.Generator) -> "_Beetles":
+    def moved(self, search: BeetleSearch, rng: np.random.Generator) -> "_VertexSwarm":
         """The same after n / 2 moves."""
         other = copy(self)
         other._x = self._x.copy()
@@ -203,7 +207,7 @@ class _Beetles:
             other.move(step, step / search.c, k, rng)
         return other
 
-    def least_missed(self, most: int) -> list[tuple[IntArray, int]]:
+    def cheapest_removals(self, most: int) -> list[tuple[IntArray, int]]:
         """Vertices that may be dropped, and what that adds to the sum; first what is missed least
         for its number.
 
@@ -212,14 +216,14 @@ class _Beetles:
         """
         start, end = self._edges()
         ends = np.cumsum(self._sizes)
-        around, across = self._coverage.difference(
+        around, across = self._evaluator.count_added_pixels(
             np.concatenate([start, start[self._before]]), np.concatenate([end, end])
         ).reshape(2, -1)
         missed = (across - around - around[self._before]).astype(np.float64)
         for ring in np.flatnonzero(self._sizes == 3).tolist():
             first = ends[ring] - 3
             missed[first : first + 3] = (
-                -around[first : first + 3].sum() / 3 if self._spare(ring) else np.inf
+                -around[first : first + 3].sum() / 3 if self._is_removable(ring) else np.inf
             )
             missed[first + 1 : first + 3] = np.inf
         order = np.argsort(missed, kind="stable")[:most]
@@ -230,13 +234,13 @@ class _Beetles:
             if np.isfinite(missed[i])
         ]
 
-    def missed_together(self, count: int) -> list[tuple[IntArray, int]]:
-        """`count` vertices to drop at a time, least missed and no neighbours, and what that adds;
+    def joint_removals(self, count: int) -> list[tuple[IntArray, int]]:
+        """`count` vertices to drop at a time, least missed and no neighbors, and what that adds;
         none if too few.
         """
         chosen: list[int] = []
         total, near = 0, set[int]()
-        for (first, *_), added in self.least_missed(2 * count):
+        for (first, *_), added in self.cheapest_removals(2 * count):
             i = int(first)
             if self._size[i] >= _LONG and i not in near:
                 chosen.append(i)
@@ -246,7 +250,7 @@ class _Beetles:
                 return [(np.sort(chosen), total)]
         return []
 
-    def _spare(self, ring: int) -> bool:
+    def _is_removable(self, ring: int) -> bool:
         """Whether a ring may go as a whole."""
         owner = self._owner
         if ring and owner[ring - 1] == owner[ring]:
@@ -255,7 +259,7 @@ class _Beetles:
             ring + 1 < len(owner) and owner[ring + 1] == owner[ring]
         )
 
-    def without(self, dropped: IntArray, added: int) -> "_Beetles":
+    def without(self, dropped: IntArray, added: int) -> "_VertexSwarm":
         """All but some vertices, and all but rings that have none left. added: to the sum, as
         `least_missed` has it.
         """
@@ -274,15 +278,15 @@ class _Beetles:
 
     def iou(self) -> float:
         """With the outline, 0..1."""
-        return self._coverage.iou_of(*self._edges())
+        return self._evaluator.iou_of_edges(*self._edges())
 
-    def iou_about(self) -> float:
+    def approximate_iou(self) -> float:
         """The same from what f has added up to and the rings' areas, not their pixels: a fifth of
         the time.
         """
         start, end = self._edges()
         twice = float(np.vdot(start[:, 0], end[:, 1]) - np.vdot(start[:, 1], end[:, 0]))
-        return self._coverage.iou_about(abs(twice) / 2, self._apart)
+        return self._evaluator.approximate_iou(abs(twice) / 2, self._apart)
 
     def polygons(self) -> list[Polygon]:
         """What the beetles stand around."""

@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.contour.polygons import CENTRE, Polygon, crossings, edges
+from cohdc_train.contour.polygons import CENTER, Polygon, crossings, edges
 from cohdc_train.types import FloatArray, Int32Array, IntArray, Mask
 
 _PER_PX = 5  # places for a vertex along a px: one decimal in a file, and the grid that COCO's tools fill on
 
 
-class Coverage:
+class IoUEvaluator:
     """The outline that simpler ones are compared with, on the grid of its bounds.
 
-    Nothing is filled. A crossing with a column's centre line has a place, which counts rows down
+    Nothing is filled. A crossing with a column's center line has a place, which counts rows down
     the columns one after another. Between the first place and the second, the third and the fourth
     and so on in their order lie the pixels
     inside: the even-odd rule. Places of two outlines together enclose the pixels that only one of
@@ -28,7 +28,7 @@ class Coverage:
         start, end = edges(rings)
         axes = np.ascontiguousarray(start.T)
         self.low, self.high = np.floor(axes.min(1)), np.ceil(axes.max(1))
-        self._first_centre = self.low + CENTRE
+        self._first_center = self.low + CENTER
         self._width, height = (self.high - self.low).astype(int).tolist()
         self._rows = height + 1  # places in a column
         across = np.flatnonzero(
@@ -38,20 +38,20 @@ class Coverage:
             self._crossed(start.take(across, axis=0), end.take(across, axis=0))[0]
         )
         self.area = _enclosed(self._places)
-        self._sign = _turn(polygons[0].outer)
+        self._sign = _orientation(polygons[0].outer)
 
     def iou(self, polygons: Sequence[Polygon]) -> float:
         """IoU, 0..1, of polygons that lie within the bounds, as they are filled by the even-odd
         rule.
         """
         rings = [ring for polygon in polygons for ring in polygon.rings]
-        return self.iou_of(*edges(rings)) if rings else 0.0
+        return self.iou_of_edges(*edges(rings)) if rings else 0.0
 
-    def iou_of(self, start: FloatArray, end: FloatArray) -> float:
+    def iou_of_edges(self, start: FloatArray, end: FloatArray) -> float:
         """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
-        return self.iou_about(*self.counts(start, end))
+        return self.approximate_iou(*self.count_pixels(start, end))
 
-    def counts(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
+    def count_pixels(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
         """Pixels that closed rings cover, and that only they or the outline have; edges [E, 2] ->
         [E, 2].
         """
@@ -61,11 +61,11 @@ class Coverage:
         both.sort()
         return _enclosed(places), _enclosed(both)
 
-    def iou_about(self, covered: float, apart: int) -> float:
+    def approximate_iou(self, covered: float, apart: int) -> float:
         """IoU of what covers so many pixels, so many of which only one of it and the outline has."""
         return (self.area + covered - apart) / (self.area + covered + apart)
 
-    def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
+    def count_added_pixels(self, start: FloatArray, end: FloatArray) -> IntArray:
         """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
 
         Less a constant per column, which is the same for all ways from one point to another; of
@@ -93,12 +93,12 @@ class Coverage:
         """Places where edges cross the columns, the first of every edge, and the columns it runs
         along.
         """
-        places, row, first, run = crossings(start, end, self._first_centre)
+        places, row, first, run = crossings(start, end, self._first_center)
         places *= self._rows
         places += row
         return places, first, run
 
-    def nearest(self, points: FloatArray) -> FloatArray:
+    def snap_to_grid(self, points: FloatArray) -> FloatArray:
         """Points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
         placed: FloatArray = (
             points * _PER_PX
@@ -111,16 +111,16 @@ class Coverage:
             np.clip(line, self.low[axis], self.high[axis], out=line)
         return placed
 
-    def valid(self, polygons: Sequence[Polygon]) -> bool:
+    def is_valid(self, polygons: Sequence[Polygon]) -> bool:
         """Whether no ring crosses another or itself, and all turn as the outline's do: holes
         against outer rings.
         """
         for polygon in polygons:
-            if _turn(polygon.outer) != self._sign or any(
-                _turn(hole) != -self._sign for hole in polygon.holes
+            if _orientation(polygon.outer) != self._sign or any(
+                _orientation(hole) != -self._sign for hole in polygon.holes
             ):
                 return False
-        return not crossing([ring for polygon in polygons for ring in polygon.rings])
+        return not rings_cross([ring for polygon in polygons for ring in polygon.rings])
 
 
 def _enclosed(places: FloatArray) -> int:
@@ -134,7 +134,7 @@ def _signs(bits: int) -> FloatArray:
     return np.tile([-1.0, 1.0], 2**bits // 2)
 
 
-def _turn(ring: FloatArray) -> int:
+def _orientation(ring: FloatArray) -> int:
     """-1 where a ring [n, 2] goes clockwise as seen in an image, else 1."""
     return 1 if cv2.contourArea(ring.astype(np.float32), oriented=True) < 0 else -1
 
@@ -142,7 +142,7 @@ def _turn(ring: FloatArray) -> int:
 _BLOCK = 1024  # edges compared at a time
 
 
-def crossing(rings: Sequence[FloatArray]) -> bool:
+def rings_cross(rings: Sequence[FloatArray]) -> bool:
     """Whether two edges cross, of one ring or of two; rings that only touch do not.
 
     Exact for points with one decimal.
@@ -153,13 +153,15 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
     blocks = [points[:, i : i + _BLOCK] for i in range(0, points.shape[1], _BLOCK)]
     for k, block in enumerate(blocks):
         for other in blocks[k:]:
-            parted = _parted(block, other)
-            if np.count_nonzero(parted & (parted if other is block else _parted(other, block)).T):
+            parted = _separates(block, other)
+            if np.count_nonzero(
+                parted & (parted if other is block else _separates(other, block)).T
+            ):
                 return True
     return False
 
 
-def _parted(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> Mask:
+def _separates(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> Mask:
     """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different
     sides: [m, n].
     """

@@ -9,9 +9,9 @@ import numpy as np
 
 from cohdc_train.types import FloatArray, IntArray, Mask
 
-CENTRE = np.array(
+CENTER = np.array(
     [0.5, 0.5 + 1e-7]
-)  # px; an edge that near a pixel's centre goes through it, wherever the grid begins
+)  # px; an edge that near a pixel's center goes through it, wherever the grid begins
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,17 @@ class Polygon:
         """The part as one ring [n, 2], px: every hole is joined by a bridge of no width, for
         formats without holes.
         """
-        return _bridged(self.rings)
+        return _bridge(self.rings)
 
 
-def joined(polygons: Sequence[Polygon]) -> FloatArray:
+def join_polygons(polygons: Sequence[Polygon]) -> FloatArray:
     """All parts as one ring [n, 2], px, joined by bridges of no width, for formats of one ring per
     object.
     """
-    return _bridged([polygon.keyhole() for polygon in polygons])
+    return _bridge([polygon.keyhole() for polygon in polygons])
 
 
-def _bridged(rings: Sequence[FloatArray]) -> FloatArray:
+def _bridge(rings: Sequence[FloatArray]) -> FloatArray:
     ring = rings[0]
     for other in rings[1:]:
         gaps = np.linalg.norm(ring[:, None] - other, axis=2)
@@ -55,9 +55,9 @@ def trace(mask: Mask) -> list[Polygon]:
     """The outline of a mask [H, W] along the edges of its pixels, one polygon per 8-connected part.
 
     Filling the polygons gives exactly the mask back (inner corners are cut by half a pixel, which
-    reaches no pixel's centre); an empty mask has none.
+    reaches no pixel's center); an empty mask has none.
     """
-    # a grid of the pixels' corners and centres: every pixel sets its 3 x 3 nodes, so the border
+    # a grid of the pixels' corners and centers: every pixel sets its 3 x 3 nodes, so the border
     # runs along pixel edges
     nodes = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
     nodes[1::2, 1::2] = mask
@@ -101,14 +101,14 @@ def pixel_borders(mask: Mask) -> list[list[float]] | None:
 
 
 def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> Mask:
-    """Fill polygons by the even-odd rule at pixel centres. size: (height, width), px. Returns
+    """Fill polygons by the even-odd rule at pixel centers. size: (height, width), px. Returns
     [height, width] bool.
     """
     if not polygons:
         return np.zeros(size, np.bool_)
     height, width = size
     start, end = edges([ring for polygon in polygons for ring in polygon.rings])
-    met = crossings(start, end, CENTRE, width)
+    met = crossings(start, end, CENTER, width)
     place = met.row.clip(0, height) * width + met.column
     hits = np.bincount(place.astype(np.int64), minlength=(height + 1) * width).reshape(
         height + 1, width
@@ -128,9 +128,9 @@ def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
 
 
 class Crossings(NamedTuple):
-    """Where E edges cross the centre lines of a grid's columns, N times, edge after edge.
+    """Where E edges cross the center lines of a grid's columns, N times, edge after edge.
 
-    column, row: [N] whole numbers; the row is that of the first pixel centre below.
+    column, row: [N] whole numbers; the row is that of the first pixel center below.
     first: [E], the first crossing of every edge; run: [E], columns from its start to its end, with
     their sign.
     """
@@ -146,7 +146,7 @@ def crossings(
 ) -> Crossings:
     """Crossings of edges [E, 2] -> [E, 2], px, with columns.
 
-    origin: [2] px, the CENTRE of the grid's first pixel. width: that the columns are limited to;
+    origin: [2] px, the CENTER of the grid's first pixel. width: that the columns are limited to;
     without it no point may lie beside the grid.
     """
     x, to_x = start[:, 0] - origin[0], end[:, 0] - origin[0]
@@ -168,6 +168,6 @@ def crossings(
     return Crossings(column, np.ceil(row, out=row), first, run)
 
 
-def vertices(polygons: Sequence[Polygon]) -> int:
+def count_vertices(polygons: Sequence[Polygon]) -> int:
     """How many vertices polygons have together."""
     return sum(len(ring) for polygon in polygons for ring in polygon.rings)

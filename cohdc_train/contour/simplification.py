@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 
 from cohdc_train.contour.beetle_search import BeetleSearch, search_vertices
-from cohdc_train.contour.polygon_iou import Coverage
-from cohdc_train.contour.polygons import Polygon, vertices
-from cohdc_train.contour.tolerance_search import Bracket
+from cohdc_train.contour.polygon_iou import IoUEvaluator
+from cohdc_train.contour.polygons import Polygon, count_vertices
+from cohdc_train.contour.tolerance_search import ToleranceBracket
 from cohdc_train.types import FloatArray
 
-Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
-METHODS: tuple[Method, ...] = get_args(Method)
+ContourMethod = Literal["bisection", "bas_dp", "dp", "visvalingam"]
+METHODS: tuple[ContourMethod, ...] = get_args(ContourMethod)
 Reduction = Callable[[FloatArray, float], FloatArray]
 
 _EVALUATIONS = 9  # of a tolerance at most; three or four do
@@ -29,7 +29,7 @@ _LOST = 0.175  # area lost per px of tolerance and px of outline, about
 def simplify(
     polygons: Sequence[Polygon],
     iou_floor: float = 0.95,
-    method: Method = "bisection",
+    method: ContourMethod = "bisection",
     epsilon: float = 2.0,
     search: BeetleSearch | None = None,
 ) -> list[Polygon]:
@@ -47,7 +47,7 @@ def simplify(
     Args:
         polygons: as `trace` gives them.
         iou_floor: least IoU, 0..1, of the result with the polygons given, both filled at pixel
-            centres; not of `dp`.
+            centers; not of `dp`.
         method: one of METHODS.
         epsilon: the tolerance of `dp`, px.
         search: parameters of `bas_dp`.
@@ -60,18 +60,21 @@ def simplify(
     if not polygons:
         return []
     if method == "dp":
-        return _each_ring(polygons, _douglas_peucker, epsilon)
-    coverage = Coverage(polygons)
+        return _reduce_rings(polygons, _douglas_peucker, epsilon)
+    evaluator = IoUEvaluator(polygons)
     finer = _bisect(
-        polygons, iou_floor, coverage, _visvalingam if method == "visvalingam" else _douglas_peucker
+        polygons,
+        iou_floor,
+        evaluator,
+        _visvalingam if method == "visvalingam" else _douglas_peucker,
     )
     if method != "bas_dp":
         return finer
-    return search_vertices(finer, iou_floor, coverage, search or BeetleSearch())
+    return search_vertices(finer, iou_floor, evaluator, search or BeetleSearch())
 
 
 def _bisect(
-    polygons: Sequence[Polygon], iou_floor: float, coverage: Coverage, reduce: Reduction
+    polygons: Sequence[Polygon], iou_floor: float, evaluator: IoUEvaluator, reduce: Reduction
 ) -> list[Polygon]:
     """The result with the fewest vertices among tolerances that keep the floor; the outline itself
     if none does.
@@ -81,29 +84,29 @@ def _bisect(
         for polygon in polygons
         for ring in polygon.rings
     )
-    coarsest = max(_COARSEST * hypot(*(coverage.high - coverage.low)), 2 * _FINEST)
-    bracket = Bracket.of(_FINEST, coarsest, 1 - iou_floor, _LOST * length / coverage.area)
+    coarsest = max(_COARSEST * hypot(*(evaluator.high - evaluator.low)), 2 * _FINEST)
+    bracket = ToleranceBracket.of(_FINEST, coarsest, 1 - iou_floor, _LOST * length / evaluator.area)
     kept: list[list[Polygon]] = []
     for _ in range(_EVALUATIONS):
-        coarser = _each_ring(polygons, reduce, exp(bracket.at))
-        iou = coverage.iou(coarser)
+        coarser = _reduce_rings(polygons, reduce, exp(bracket.at))
+        iou = evaluator.iou(coarser)
         if iou >= iou_floor:
             kept.append(coarser)
-        if not bracket.add(1 - iou, vertices(coarser), iou >= iou_floor):
+        if not bracket.add(1 - iou, count_vertices(coarser), iou >= iou_floor):
             break
     # The IoU does not fall evenly, so that a later one may have more vertices.
-    for coarser in sorted(kept, key=vertices):
-        if coverage.valid(coarser):
+    for coarser in sorted(kept, key=count_vertices):
+        if evaluator.is_valid(coarser):
             return coarser
     epsilon = exp(bracket.low.at)
     while kept and (epsilon := epsilon * _FINER) > _FINEST:  # rings cross: where they do not yet
-        coarser = _each_ring(polygons, reduce, epsilon)
-        if coverage.iou(coarser) >= iou_floor and coverage.valid(coarser):
+        coarser = _reduce_rings(polygons, reduce, epsilon)
+        if evaluator.iou(coarser) >= iou_floor and evaluator.is_valid(coarser):
             return coarser
     return list(polygons)
 
 
-def _each_ring(polygons: Sequence[Polygon], reduce: Reduction, epsilon: float) -> list[Polygon]:
+def _reduce_rings(polygons: Sequence[Polygon], reduce: Reduction, epsilon: float) -> list[Polygon]:
     reduced = []
     for polygon in polygons:
         outer, *holes = (reduce(ring, epsilon) for ring in polygon.rings)
@@ -117,7 +120,7 @@ def _douglas_peucker(ring: FloatArray, epsilon: float) -> FloatArray:
 
 
 def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
-    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px,
+    """Without the vertices whose triangle with their neighbors is smaller than epsilon^2 px,
     smallest first.
     """
     area = epsilon**2

@@ -14,7 +14,7 @@ _LEAST_LOST = 1e-6
 
 
 @dataclass
-class _End:
+class _BracketEnd:
     """One end of the bracket: the logarithm of a tolerance, and what is known of its result."""
 
     at: float
@@ -23,7 +23,7 @@ class _End:
 
 
 @dataclass
-class Bracket:
+class ToleranceBracket:
     """Two tolerances, of which the finer keeps the floor and the coarser does not.
 
     What is lost grows about as the tolerance, so that on logarithmic scales a line through what is
@@ -31,21 +31,21 @@ class Bracket:
     `add` moves on.
     """
 
-    low: _End
-    high: _End
+    low: _BracketEnd
+    high: _BracketEnd
     allowed: float
     at: float
     _step: float = field(default=_FIRST_STEP, init=False)
 
     @classmethod
-    def of(cls, finest: float, coarsest: float, allowed: float, rise: float) -> "Bracket":
+    def of(cls, finest: float, coarsest: float, allowed: float, rise: float) -> "ToleranceBracket":
         """Between two tolerances, px. allowed: 1 - the floor; rise: what is lost per px of
         tolerance.
         """
         low, high, allowed = log(finest), log(coarsest), max(allowed, _LEAST_LOST)
         return cls(
-            _End(low),
-            _End(high),
+            _BracketEnd(low),
+            _BracketEnd(high),
             allowed,
             min(max(log(allowed / rise), low + _NARROW), high - _NARROW),
         )
@@ -56,7 +56,7 @@ class Bracket:
         It is not when the floor is all but reached, when the bracket is narrow, or when one vertex
         is all that its ends differ by.
         """
-        here = _End(self.at, vertices, log(max(lost, _LEAST_LOST) / self.allowed))
+        here = _BracketEnd(self.at, vertices, log(max(lost, _LEAST_LOST) / self.allowed))
         if keeps:
             self.low = here
         else:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import yaml
 
-from cohdc_train.contour import Polygon, joined
+from cohdc_train.contour import Polygon, join_polygons
 from cohdc_train.drawing import write_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.files import OwnFiles, write_text
@@ -257,7 +257,7 @@ class YoloWriter:
         lines = []
         labels = result.detections.labels.tolist()
         for label, outline in zip(labels, result.outlines, strict=True):
-            shares = (joined(outline) / (width, height)).ravel()
+            shares = (join_polygons(outline) / (width, height)).ravel()
             words = [f"{share:.6f}".rstrip("0").rstrip(".") for share in shares]
             lines.append(" ".join([str(label), *words]) + "\n")
         write_text(self._own.path(f"labels/{image.stem}.txt"), "".join(lines))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from cohdc_train.contour import Method
+from cohdc_train.contour import ContourMethod
 from cohdc_train.errors import DataError
 
 AnnotationFormat = Literal["coco", "labelme", "yolo"]
@@ -29,7 +29,7 @@ class PredictOptions:
     score: float = 0.5
     quality: float | None = None
     format: AnnotationFormat = "coco"
-    contour: Method = "bas_dp"
+    contour: ContourMethod = "bas_dp"
     iou_floor: float = 0.95
     check_below: float = 0.7
     threads: int = 0

@@ -1,5 +1,6 @@
-"""Rendered data: COCO-format sets and TUM-format sequences of people walking in rooms. Importing it
-stays cheap.
+"""Rendered COCO-format sets and TUM-format sequences of people walking in rooms.
+
+Importing the package loads neither torch nor the ray caster.
 """
 
 from cohdc_train.synth.coco import coco

@@ -1,6 +1,4 @@
-"""Masks -> COCO annotations, in numpy and OpenCV: outlines along pixel borders, run lengths where
-there are holes.
-"""
+"""Turn masks into COCO annotations, in numpy and OpenCV."""
 
 from typing import Any
 
@@ -11,7 +9,7 @@ from cohdc_train.types import Mask
 
 
 def run_lengths(mask: Mask) -> dict[str, list[int]]:
-    """COCO's uncompressed RLE: runs of 0, 1, 0, ... down the columns. mask: [H, W]."""
+    """Return COCO's uncompressed RLE of a mask [H, W]: runs of 0, 1, 0, ... by column."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(np.diff(flat)) + 1
     edges = np.concatenate([[0] if not flat[0] else [0, 0], changes, [flat.size]])
@@ -19,8 +17,13 @@ def run_lengths(mask: Mask) -> dict[str, list[int]]:
 
 
 def annotate(mask: Mask, image_id: int, annotation_id: int, crowd: bool = False) -> dict[str, Any]:
-    """The COCO annotation of one visible person. mask: [H, W], not empty; a crowd is ignored by
-    losses and scores.
+    """Return the COCO annotation of one visible person: polygons, or run lengths where it has holes.
+
+    Args:
+        mask: [H, W] bool, not empty.
+        image_id: of the image.
+        annotation_id: of the annotation.
+        crowd: losses and scores ignore the person.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     left, top = int(columns[0]), int(rows[0])

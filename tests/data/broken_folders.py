@@ -25,7 +25,7 @@ class Broken(NamedTuple):
 
     change: Change
     kind: str
-    mended: bool = True
+    fixed: bool = True
 
 
 def _set(index: int, **values: Any) -> Change:
@@ -160,9 +160,9 @@ BROKEN: dict[str, Broken] = {
     ),
     "two ids for one name": Broken(_second_person, "category-name-twice"),
     "category nobody uses": Broken(
-        _add("categories", {"id": 30, "name": "cart"}), "classes-differ", mended=False
+        _add("categories", {"id": 30, "name": "cart"}), "classes-differ", fixed=False
     ),
-    "class of one split only": Broken(_class_only_in_train, "classes-differ", mended=False),
+    "class of one split only": Broken(_class_only_in_train, "classes-differ", fixed=False),
     "image without a width": Broken(lambda c, r: c["images"][0].pop("width"), "image-broken"),
     "image id twice": Broken(_again("images", file_name="train_2.png"), "image-id-twice"),
     "image file listed twice": Broken(_listed_twice, "image-listed-twice"),
@@ -176,7 +176,7 @@ BROKEN: dict[str, Broken] = {
     "JPEG turned by EXIF": Broken(_turned_by_exif, "image-turned"),
     "JPEG upside down by EXIF": Broken(_jpeg(turned=3), "image-turned"),
     "JPEG of EXIF, annotated unturned": Broken(_jpeg(turned=6), "image-exif"),
-    "CMYK": Broken(_jpeg(mode="CMYK"), "image-colour"),
+    "CMYK": Broken(_jpeg(mode="CMYK"), "image-color"),
     "width and height swapped": Broken(_swapped_size, "image-size"),
     "image resized, annotations not": Broken(_resized, "image-size"),
     "image of 48 megapixels": Broken(_huge, "image-huge"),
@@ -247,7 +247,7 @@ BROKEN: dict[str, Broken] = {
     ),
     "crowd": Broken(_set(0, iscrowd=1), "crowd"),
     "crowd as text": Broken(_set(0, iscrowd="1"), "crowd"),
-    "validation image in train": Broken(_leak, "leak", mended=False),
+    "validation image in train": Broken(_leak, "leak", fixed=False),
 }
 
 

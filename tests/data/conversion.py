@@ -55,7 +55,7 @@ def file_names(split: CocoSplit) -> list[str]:
     return [row["file_name"] for row in json.loads(split.annotations.read_text())["images"]]
 
 
-def refused(tmp_path: Path, format: Any, source: Path, message: str, **options: Any) -> None:
+def assert_refused(tmp_path: Path, format: Any, source: Path, message: str, **options: Any) -> None:
     """It is said in one line, and nothing is written."""
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(DataError, match=message) as caught:

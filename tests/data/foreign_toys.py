@@ -41,7 +41,7 @@ def box_mask(x0: int, y0: int, x1: int, y1: int) -> NDArray[np.uint8]:
 
 
 def disk_mask(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> NDArray[np.uint8]:
-    """[HEIGHT, WIDTH], 1 where a pixel's centre is inside of the ellipse."""
+    """[HEIGHT, WIDTH], 1 where a pixel's center is inside of the ellipse."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     along = (x - cx) * np.cos(theta) + (y - cy) * np.sin(theta)
     across = (y - cy) * np.cos(theta) - (x - cx) * np.sin(theta)
@@ -141,12 +141,12 @@ def yolo(
 def palette_png(path: Path, values: NDArray[Any]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     image = Image.fromarray(values.astype(np.uint8))
-    image.putpalette([value for i in range(256) for value in voc_colour(i)])
+    image.putpalette([value for i in range(256) for value in voc_color(i)])
     image.save(path)
     return path
 
 
-def voc_colour(index: int) -> tuple[int, int, int]:
+def voc_color(index: int) -> tuple[int, int, int]:
     """By the devkit's formula, for the first classes and void."""
     known = {0: (0, 0, 0), 1: (128, 0, 0), 2: (0, 128, 0), 7: (128, 128, 128), 15: (192, 128, 128)}
     return known.get(index, (224, 224, 192) if index == 255 else (index, 3, 5))

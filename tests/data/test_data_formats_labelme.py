@@ -9,16 +9,14 @@ import cv2
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import converted, drawn, image_of, iou, masks_of, refused
+from conversion import assert_refused, converted, drawn, image_of, iou, masks_of
 from PIL import Image
 
 from cohdc_train.cli import main
 from cohdc_train.data.annotations import read_image
 
 
-def test_labelme_every_shape_with_an_inside(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_labelme_reads_every_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = toys.labelme(tmp_path / "source")
     spot = np.pad(np.ones((5, 7), np.uint8), ((1, 0), (0, 2)))
     groups = [[2.0, 2.0, 12.0, 2.0, 12.0, 9.0, 2.0, 9.0], [40.0, 30.0, 50.0, 30.0, 45.0, 40.0]]
@@ -71,7 +69,7 @@ def test_labelme_every_shape_with_an_inside(
     assert outside in capsys.readouterr().out.splitlines()
 
 
-def test_labelme_image_inside_the_json_or_elsewhere(tmp_path: Path) -> None:
+def test_labelme_image_is_found_inside_json_or_in_other_folder(tmp_path: Path) -> None:
     root = toys.labelme(tmp_path / "source" / "json")
     png = (root / "a.png").read_bytes()
     data = toys.base64_png(np.asarray(Image.open(root / "a.png")))
@@ -98,7 +96,7 @@ def test_labelme_image_inside_the_json_or_elsewhere(tmp_path: Path) -> None:
     )
 
 
-def test_pictures_that_exif_turns_are_written_as_they_were_annotated(
+def test_images_turned_by_exif_are_written_as_annotated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Orientation 6 shows the right column first; the file's width is the picture's height."""
@@ -136,7 +134,7 @@ LABELME_ERRORS = {
     r"a\.json: shape 1: no label$": lambda p: toys.labelme_file(
         p, [toys.shape("", "polygon", toys.PERSON)]
     ),
-    r"a\.json: shape 1: circle needs its centre": lambda p: toys.labelme_file(
+    r"a\.json: shape 1: circle needs its center": lambda p: toys.labelme_file(
         p, [toys.shape("x", "circle", [1, 2])]
     ),
     r"a\.json: shape 2: rectangle needs two": lambda p: toys.labelme_file(
@@ -168,7 +166,7 @@ LABELME_ERRORS = {
 
 
 @pytest.mark.parametrize("message", LABELME_ERRORS)
-def test_labelme_errors(tmp_path: Path, message: str) -> None:
+def test_labelme_error_names_file_and_shape(tmp_path: Path, message: str) -> None:
     root = toys.labelme(tmp_path / "source")
     LABELME_ERRORS[message](root / "a.json")
-    refused(tmp_path, "labelme", root, message)
+    assert_refused(tmp_path, "labelme", root, message)

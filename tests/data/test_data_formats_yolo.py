@@ -8,7 +8,7 @@ from pathlib import Path
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import converted, drawn, file_names, image_of, masks_of, refused
+from conversion import assert_refused, converted, drawn, file_names, image_of, masks_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +25,7 @@ YAMLS = {
 
 
 @pytest.mark.parametrize("layout", YAMLS)
-def test_yolo_every_way_to_say_where(tmp_path: Path, layout: str) -> None:
+def test_yolo_finds_images_by_folder_list_and_several(tmp_path: Path, layout: str) -> None:
     root = toys.yolo(tmp_path / "source", YAMLS[layout])
     toys.write(
         root / "train.txt", "./images/train/a.png\n\nimages/train/b.png\n./images/train/c.png\n"
@@ -38,7 +38,7 @@ def test_yolo_every_way_to_say_where(tmp_path: Path, layout: str) -> None:
     ]
 
 
-def test_yolo_labels_beside_images_and_the_yaml_itself(tmp_path: Path) -> None:
+def test_yolo_labels_in_image_folder_and_yaml_file_as_source(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for seed, split in enumerate(("train", "valid")):
         toys.picture(root / split / "images" / "x.png", seed)
@@ -54,7 +54,7 @@ def test_yolo_labels_beside_images_and_the_yaml_itself(tmp_path: Path) -> None:
     )
 
 
-def test_yolo_boxes_are_rectangles_and_said_aloud(
+def test_yolo_boxes_become_rectangles_and_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = toys.yolo(tmp_path / "source", YAMLS["folders"] + "test: images/test\n")
@@ -84,15 +84,15 @@ def test_yolo_boxes_are_rectangles_and_said_aloud(
 @given(
     height=st.integers(20, 300),
     width=st.integers(20, 300),
-    centre=st.tuples(st.floats(0.3, 0.7), st.floats(0.3, 0.7)),
+    center=st.tuples(st.floats(0.3, 0.7), st.floats(0.3, 0.7)),
     radii=st.lists(st.floats(0.1, 0.29), min_size=3, max_size=30),
 )
-def test_yolo_polygons_come_back(
-    height: int, width: int, centre: tuple[float, float], radii: list[float]
+def test_yolo_polygons_are_converted_exactly(
+    height: int, width: int, center: tuple[float, float], radii: list[float]
 ) -> None:
     angles = np.arange(len(radii)) * 2 * np.pi / len(radii)
     star = np.stack(
-        [centre[0] + radii * np.cos(angles), centre[1] + radii * np.sin(angles)], axis=1
+        [center[0] + radii * np.cos(angles), center[1] + radii * np.sin(angles)], axis=1
     ).clip(0, 1)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "source"
@@ -139,22 +139,22 @@ YAML_ERRORS = {
 
 
 @pytest.mark.parametrize("row", YOLO_ERRORS)
-def test_yolo_row_errors(tmp_path: Path, row: str) -> None:
+def test_yolo_row_error_names_file_and_line(tmp_path: Path, row: str) -> None:
     root = toys.yolo(tmp_path / "source")
     toys.write(root / "labels" / "train" / "a.txt", f"{toys.yolo_row(0, toys.PERSON)}\n{row}\n")
-    refused(tmp_path, "yolo", root, YOLO_ERRORS[row])
+    assert_refused(tmp_path, "yolo", root, YOLO_ERRORS[row])
 
 
 @pytest.mark.parametrize("yaml", YAML_ERRORS)
-def test_yolo_yaml_errors(tmp_path: Path, yaml: str) -> None:
+def test_yolo_yaml_error_names_file(tmp_path: Path, yaml: str) -> None:
     root = toys.yolo(tmp_path / "source", yaml)
     toys.write(root / "list.txt", "images/train/a.png\nimages/gone.png\n")
-    refused(tmp_path, "yolo", root, YAML_ERRORS[yaml])
+    assert_refused(tmp_path, "yolo", root, YAML_ERRORS[yaml])
 
 
-def test_yolo_needs_one_yaml(tmp_path: Path) -> None:
+def test_yolo_folder_needs_exactly_one_yaml(tmp_path: Path) -> None:
     root = toys.yolo(tmp_path / "source")
     (root / "data.yaml").rename(root / "one.yaml")
     toys.write(root / "two.yml", "")
-    refused(tmp_path, "yolo", root, r"source: 2 YAML files where data\.yaml should be$")
-    refused(tmp_path, "yolo", root / "images", r"images: no data\.yaml$")
+    assert_refused(tmp_path, "yolo", root, r"source: 2 YAML files where data\.yaml should be$")
+    assert_refused(tmp_path, "yolo", root / "images", r"images: no data\.yaml$")

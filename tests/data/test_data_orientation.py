@@ -110,7 +110,7 @@ def assert_labeled(pixels: NDArray[np.uint8], mask: NDArray[Any]) -> None:
 def doctor(root: Path, *options: str) -> tuple[int, dict[str, list[str]]]:
     """Exit code, and the training split's findings."""
     code = main(["data", "doctor", str(root), "--out", str(root / "seen"), *options])
-    return code, json.loads((root / "seen" / "findings.json").read_text())["train"]
+    return code, json.loads((root / "seen" / "issues.json").read_text())["train"]
 
 
 def test_labels_of_the_upright_image_lie_on_the_object(tmp_path: Path, capsys: Captured) -> None:
@@ -143,7 +143,7 @@ def test_labels_of_the_stored_pixels_lie_on_the_object(tmp_path: Path, capsys: C
 
 
 @pytest.mark.parametrize("as_stored", [False, True])
-def test_training_and_validation_see_what_was_annotated(tmp_path: Path, as_stored: bool) -> None:
+def test_training_and_validation_read_image_as_annotated(tmp_path: Path, as_stored: bool) -> None:
     root = folder(tmp_path / "a", QUARTERS if as_stored else ALL, as_stored)
     (root / "instances_val.json").write_bytes((root / "instances_train.json").read_bytes())
     data = CocoDataModule(root, canvas=(HEIGHT, WIDTH), batch_size=1, workers=0)
@@ -179,7 +179,7 @@ def test_every_reader_gives_the_same_upright_image(tmp_path: Path, suffix: str) 
             assert_labeled(pixels, mask)
 
 
-def test_a_turned_copy_of_a_validation_image_is_a_leak(tmp_path: Path) -> None:
+def test_turned_copy_of_validation_image_is_a_leak(tmp_path: Path) -> None:
     """Duplicates are found among the upright images."""
     root = folder(tmp_path / "a", (1, 3, 6, 8))
     scene = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
@@ -192,7 +192,7 @@ def test_a_turned_copy_of_a_validation_image_is_a_leak(tmp_path: Path) -> None:
     assert len(found["leak"]) == 4
 
 
-def test_the_doctor_takes_the_size_that_the_contours_fit(tmp_path: Path) -> None:
+def test_doctor_takes_image_size_that_contours_fit(tmp_path: Path) -> None:
     """A wrong size is replaced by the upright one, or by the stored one where only that fits."""
     root = folder(tmp_path / "a", (6, 6))
     content = json.loads((root / "instances_train.json").read_text())
@@ -256,7 +256,7 @@ def test_pixels_are_as_pillow_shows_them(size: tuple[int, int], turned: int, suf
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, of damaged EXIF
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=60), HEADS)
-def test_damaged_exif_turns_nothing_and_stops_nothing(tail: bytes, head: bytes) -> None:
+def test_damaged_exif_is_ignored(tail: bytes, head: bytes) -> None:
     data = io.BytesIO()
     draw().save(data, format="JPEG", exif=head + tail)
     with Image.open(data) as image:

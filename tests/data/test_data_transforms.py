@@ -85,7 +85,7 @@ def test_without_jitter_the_image_fits_and_the_rest_is_zero() -> None:
     assert mask_boxes(placement.mask(mask)[None]).tolist() == [[12, 15, 30, 30]]
 
 
-def test_the_jitter_covers_its_range() -> None:
+def test_scale_jitter_covers_its_range() -> None:
     torch.manual_seed(0)
     placements = [
         Placement.draw((60, 60), (60, 60), Augmentation(0.5, (0.5, 1.5))) for _ in range(300)
@@ -98,12 +98,12 @@ def test_the_jitter_covers_its_range() -> None:
 
 
 @pytest.mark.parametrize("jitter", [(0.0, 1.0), (1.5, 0.5)])
-def test_a_senseless_jitter_is_refused(jitter: tuple[float, float]) -> None:
+def test_invalid_scale_jitter_is_refused(jitter: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="scale_jitter"):
         Augmentation(scale_jitter=jitter)
 
 
-def test_a_probability_above_one_is_refused() -> None:
+def test_probability_above_one_is_refused() -> None:
     with pytest.raises(ValueError, match="copy_paste 2"):
         Augmentation(copy_paste=2)
 
@@ -123,7 +123,7 @@ def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> No
     assert (blank[3, :, 1:, 1:] == 0).all()
 
 
-def test_a_moving_cameras_faults_leave_an_image_in_its_range() -> None:
+def test_degraded_images_stay_in_value_range() -> None:
     """Every fault at once, on stripes: the image is another one, blurred and darker or lighter, and
     still an image.
     """

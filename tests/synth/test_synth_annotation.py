@@ -24,7 +24,7 @@ def decoded(segmentation: Any, shape: tuple[int, int]) -> np.ndarray:
 
 @settings(max_examples=150, deadline=None)
 @given(mask=arrays(bool, st.tuples(st.integers(2, 14), st.integers(2, 14))))
-def test_any_mask_survives(mask: np.ndarray) -> None:
+def test_any_mask_is_annotated_exactly(mask: np.ndarray) -> None:
     np.testing.assert_array_equal(decoded(run_lengths(mask), mask.shape), mask)
     if mask.any():
         annotation = annotate(mask, 3, 9)

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import torch
 
-from cohdc_train.contour import Polygon, rasterize, simplify, trace, vertices
+from cohdc_train.contour import Polygon, count_vertices, rasterize, simplify, trace
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes, write_json, write_text
 from cohdc_train.models.cqe_targets import band_of, boundary_iou
@@ -58,7 +58,7 @@ def main() -> None:
             continue
         outlines = [trace(mask) for mask in masks]
         print(
-            f"{source}: {len(masks)} contours, {np.mean([vertices(o) for o in outlines]):.0f} vertices",
+            f"{source}: {len(masks)} contours, {np.mean([count_vertices(o) for o in outlines]):.0f} vertices",
             flush=True,
         )
         rows.append(measured("trace", source, 1.0, masks, outlines, [0.0]))
@@ -166,7 +166,7 @@ def measured(
         "source": source,
         "iou_floor": floor,
         "contours": len(masks),
-        "vertices": statistics.fmean(vertices(outline) for outline in outlines),
+        "vertices": statistics.fmean(count_vertices(outline) for outline in outlines),
         "iou_mean": statistics.fmean(overlap),
         "iou_min": min(overlap),
         "boundary_iou": statistics.fmean(edges),

@@ -1,4 +1,4 @@
-"""Annotated images side by side in one picture (OpenCV, no torch)."""
+"""Draw annotated images into one grid (OpenCV, no torch)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,9 +17,13 @@ _CROWD: Color = (255, 255, 255)
 
 
 def draw_grid(splits: Sequence[CocoSplit], path: Path, columns: int = 4, rows: int = 3) -> None:
-    """Write a JPEG of images drawn at random, always the same ones, half of them of each split;
-    objects are tinted by class and outlined, crowds white. Raises DataError naming an image that
-    cannot be read."""
+    """Write a JPEG of images drawn at random, always the same ones, the same number of each split.
+
+    Objects are tinted by class and outlined, crowds white.
+
+    Raises:
+        DataError: an image cannot be read; the message names it.
+    """
     tiles = []
     for split in splits:
         filled = [image for image in split.images if image.objects]
@@ -31,7 +35,7 @@ def draw_grid(splits: Sequence[CocoSplit], path: Path, columns: int = 4, rows: i
 
 
 def _tile(image: CocoImage, split: CocoSplit) -> Image:
-    """One image, RGB, fitted into a tile."""
+    """Return one image, RGB, fitted into a tile."""
     shown = read_fitted(image, _TILE)
     size = shown.shape[1::-1]
     for o in image.objects:
@@ -49,8 +53,10 @@ def _tile(image: CocoImage, split: CocoSplit) -> Image:
 
 
 def read_fitted(image: CocoImage, tile: tuple[int, int]) -> Image:
-    """The image, RGB, as large as fits into (height, width) px. Raises DataError when it cannot be
-    read.
+    """Read an image, RGB, as large as fits into (height, width) px.
+
+    Raises:
+        DataError: the image cannot be read.
     """
     scale = min(tile[0] / image.height, tile[1] / image.width)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
@@ -58,7 +64,7 @@ def read_fitted(image: CocoImage, tile: tuple[int, int]) -> Image:
 
 
 def _class_color(label: int) -> Color:
-    """A color of its own per class, RGB: hues a golden section apart."""
+    """Return a color of its own for each class, RGB: hues a golden section apart."""
     hue = np.array([[[round(label * 0.618 * 180) % 180, 220, 255]]], np.uint8)
     red, green, blue = (int(value) for value in cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0])
     return red, green, blue
