@@ -4,10 +4,11 @@ A command's module is imported when the command is called, so that `cohdc --help
 """
 
 import importlib
+import re
 import sys
-from collections.abc import Collection, Container, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 
@@ -73,6 +74,8 @@ _TRAIN_PACKAGES = frozenset({
 })
 # fmt: on
 
+_MAX_USAGE_OPTIONS = 40  # more are not listed in the usage line
+
 
 class UsageError(CohdcError):
     """A command line that cannot be read; exit code 2."""
@@ -125,7 +128,8 @@ def _call(name: str, args: list[str]) -> None:
             return
         if isinstance(component, dict):
             _check_subcommand(name, args, component)
-        _run_function(component, args, f"cohdc {name}")
+        renamed = getattr(module, "RENAMED_OPTIONS", {})
+        _run_function(component, args, f"cohdc {name}", renamed)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
@@ -172,8 +176,40 @@ def _normalize_options(args: Sequence[str], switches: Container[str]) -> list[st
     return normalized
 
 
-def _run_function(component: Any, args: list[str], prog: str) -> None:
-    """Run a typed function, or one of a dict of them, with options read from its signature."""
+def unknown_option(name: str, known: Collection[str], renamed: Mapping[str, str]) -> str:
+    """Format the message for an option that does not exist, with the one that is probably meant.
+
+    Args:
+        name: the option.
+        known: all options.
+        renamed: options of earlier versions, and their names of today.
+    """
+    if name in renamed:
+        return f"no option {name}; it is {renamed[name]} now"
+    close = get_close_matches(name, known, 1, 0.7)
+    return f"no option {name}; did you mean {close[0]}?" if close else f"no option {name}"
+
+
+def _short_usage(prog: str, actions: Sequence[Any]) -> str:
+    """Format the usage of a parser with its required arguments only."""
+    words = []
+    for action in actions:
+        if action.required and action.option_strings:
+            words.append(f"{action.option_strings[0]} {action.dest.upper()}")
+        elif action.required:
+            words.append(action.dest)
+    return " ".join([prog, *words, "[options]"])
+
+
+def _run_function(component: Any, args: list[str], prog: str, renamed: Mapping[str, str]) -> None:
+    """Run a typed function, or one of a dict of them, with options read from its signature.
+
+    Args:
+        component: the function or the dict.
+        args: words of the command line.
+        prog: name of the command.
+        renamed: options of earlier versions, and their names of today.
+    """
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
     switches: set[str] = set()
@@ -181,8 +217,8 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
     class Parser(ArgumentParser):
         """Parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`.
 
-        A switch inside a group needs one: `--method.loops false`. jsonargparse copies add_argument
-        for groups without its scope, so that it sees only what it gets.
+        A switch inside a group needs one: `--settings.loops.enabled false`. jsonargparse copies
+        add_argument for groups without its scope, so that it may use `switches` for others only.
         """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
@@ -193,15 +229,18 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
             return super().add_argument(*names, **kwargs)
 
         def parse_args(self, args: Any = None, *rest: Any, **kwargs: Any) -> Any:
+            self.allow_abbrev = False
+            if len(self._option_string_actions) > _MAX_USAGE_OPTIONS:
+                self.usage = _short_usage(self.prog, self._actions)
             return super().parse_args(_normalize_options(args, switches), *rest, **kwargs)
 
-        def error(self, message: str, *rest: Any, **kwargs: Any) -> Any:
-            unknown = [word for word in message.split() if word.startswith("--")]
-            if "nrecognized arguments" in message and unknown:
-                name = unknown[0].partition("=")[0]
-                message += (
-                    f"; {_closest(name, self._option_string_actions, f'{prog} --help lists them')}"
-                )
-            return super().error(message, *rest, **kwargs)
+        def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+            unknown = re.match(r"unrecognized arguments: (--[\w.]+)", message)
+            if unknown is None:
+                super().error(message, ex)
+            options = [name for name in self._option_string_actions if name.startswith("--")]
+            text = unknown_option(unknown[1], options, renamed)
+            print(f"{self.prog.replace(' [options]', '')}: {text}", file=sys.stderr)
+            raise SystemExit(2)
 
     auto_cli(component, args=args, prog=prog, as_positional=True, parser_class=Parser)

@@ -22,6 +22,8 @@ from cohdc_train.train.malloc import keep_freed_memory
 from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.validation_figures import VALIDATION_FILES, draw_validation, write_files
 
+RENAMED_OPTIONS = {"--pictures": "--figures"}
+
 
 @dataclass(frozen=True)
 class ValidationOptions:

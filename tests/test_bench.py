@@ -35,8 +35,9 @@ KEYS = {
 TINY = """
 data: {canvas: [48, 64]}
 model:
-  network: {width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16, proposals: [50, 20],
-            detections: 10}
+  network:
+    {width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16,
+     proposals: [50, 20], detections: 10}
 trainer: {accelerator: cpu, enable_model_summary: false}
 """
 
@@ -253,9 +254,7 @@ def network_of(row):
 
 
 def test_rows_differ_as_their_names_say():
-    """Table 4's networks by tensors and rates: HDC-Net is dilated and has to be a tenth smaller
-    than ResNet50.
-    """
+    """Compare Table 4's networks by tensors and rates; HDC-Net is a tenth smaller than ResNet50."""
     networks = {row: network_of(row) for row in (*ROWS, "networks/resnet50_hdc.yaml")}
     body, whole = (
         {
@@ -273,7 +272,7 @@ def test_rows_differ_as_their_names_say():
 
 
 def test_the_family_shrinks_from_m_to_n():
-    """s has nano's layers; it is made for more pixels and holds more objects."""
+    """Compare sizes: s has the layers of n, more pixels and more objects."""
     m, s, n = (network_of(f"networks/hdc_net_{size}.yaml") for size in "msn")
     sizes = [sum(p.numel() for p in network.parameters()) for network in (m, s, n)]
     assert sizes[0] > sizes[1] == sizes[2]

@@ -1,4 +1,4 @@
-"""The command line: what it costs, what it says, and how it ends."""
+"""The command line: its cost, its messages and its exit codes."""
 
 import json
 import resource
@@ -27,18 +27,21 @@ def run(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_help_costs_little_and_imports_little() -> None:
-    spent = []
+    cpu_seconds = []
     for _ in range(4):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = run("-m", "cohdc_train", "--help")
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert done.returncode == 0, done.stderr
-        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    assert min(spent) < 0.2, "seconds of CPU for cohdc --help, best of four"
+        cpu_seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    assert min(cpu_seconds) < 0.2, "seconds of CPU for cohdc --help, best of four"
 
 
 def test_help_imports_no_parser_and_no_numpy() -> None:
-    code = "import sys, json; from cohdc_train.cli import main; main(['--help']); print(json.dumps(sorted(sys.modules)))"
+    code = (
+        "import sys, json; from cohdc_train.cli import main; main(['--help']);"
+        "print(json.dumps(sorted(sys.modules)))"
+    )
     modules = set(json.loads(run("-c", code).stdout.splitlines()[-1]))
     assert modules.isdisjoint({"jsonargparse", "numpy", "cv2", "torch", "onnxruntime", "yaml"})
 
@@ -88,7 +91,17 @@ def test_mistyped_option_suggests_the_nearest(capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit) as ended:
         main(["evaluate", "a.txt", "b.txt", "--max_diference=3"])
     assert ended.value.code == 2
-    assert capsys.readouterr().err.endswith("did you mean --max_difference?\n")
+    message = "no option --max_diference; did you mean --max_difference?"
+    assert capsys.readouterr().err == f"cohdc evaluate: {message}\n"
+
+
+@pytest.mark.slow
+def test_renamed_option_names_the_new_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["validate", "model.onnx", "data", "--pictures=out"])
+    assert ended.value.code == 2
+    message = "no option --pictures; it is --figures now"
+    assert capsys.readouterr().err == f"cohdc validate: {message}\n"
 
 
 def test_unknown_option_ends_with_two(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""A checkpoint becomes an ONNX file that equals it, or no file."""
+"""`cohdc export`: a checkpoint becomes an ONNX file that equals it, or no file."""
 
 import copy
 import dataclasses
@@ -45,7 +45,7 @@ def exported(checkpoint):
 
 @pytest.fixture
 def written(exported, monkeypatch):
-    """The file that was exported once, in the place of what torch's exporter would write again."""
+    """Copy the file that was exported once where torch's exporter would write it again."""
 
     def write(network, class_names, path):
         shutil.copyfile(exported, path)
@@ -56,7 +56,7 @@ def written(exported, monkeypatch):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A COCO-format folder of the classes of the checkpoint."""
+    """Make a COCO-format folder with the classes of the checkpoint."""
     root = tmp_path_factory.mktemp("data")
     toys.folder(root)
     return root
@@ -81,9 +81,7 @@ def test_the_file_is_reported_equal_at_three_sizes_three_batches_without_detecti
 
 
 def test_gflops_of_a_detection_by_hand(exported, opinionated, small_config):
-    """Four 3x3 convolutions on 14x14 cells, a deconvolution to 28x28, and a 1x1 for background and
-    two classes.
-    """
+    """Count four 3x3 convolutions, a deconvolution, and a 1x1 for background and two classes."""
     without_cqe = count_flops(MaskRCNN(2, dataclasses.replace(small_config, cqe="off")).eval())
     c, cells = small_config.fpn_channels, 14 * 14
     flops = 2 * (4 * 9 * c * c * cells + 4 * c * c * cells + c * 3 * 4 * cells)
@@ -178,14 +176,14 @@ def test_a_pyramid_from_stride_8_on_a_light_backbone_exports(backbone, small_con
     config = dataclasses.replace(small_config, rates=((1,),) * 4, **changed)
     module = MaskRCNNModule(["person", "car"], config)
     with torch.no_grad():
-        pictures = [
+        images = [
             torch.from_numpy(cv2.resize(p, (128, 96))).permute(2, 0, 1) / 255
             for p in draw_samples(4)
         ]
         for _ in range(
             30
-        ):  # without statistics of pictures, a deep random network is nearly constant
-            module.network.train().features(torch.stack(pictures))
+        ):  # without statistics of images, a deep random network is nearly constant
+            module.network.train().features(torch.stack(images))
         module.network.eval().rpn.head.bbox_pred.weight.mul_(10)
         module.network.rpn.head.cls_logits.weight.mul_(3)
     torch.save(
@@ -225,9 +223,7 @@ def test_export_replaces_its_own_file(checkpoint, written, tmp_path):
 
 
 def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, monkeypatch):
-    """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the
-    folder.
-    """
+    """The export fails with a tolerance below rounding, and leaves no file."""
 
     monkeypatch.setitem(parity.TOLERANCES, "masks", 0.0)
     with pytest.raises(ExportError, match=r"m\.onnx: masks differ from torch by"):
@@ -242,33 +238,31 @@ def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, m
 
 
 def test_wrong_masks_and_other_detections_are_seen(opinionated, exported):
-    """The comparison fails when the network that is compared is not the one in the file."""
-    pictures = draw_samples(2)
-    parity.compare(opinionated, exported, pictures).require(exported)
+    """The comparison fails for another network than the one in the file."""
+    images = draw_samples(2)
+    parity.compare(opinionated, exported, images).require(exported)
     other = copy.deepcopy(opinionated)
     other.roi_heads.mask_predictor.mask_fcn_logits.weight.data.mul_(1.1)
-    assert parity.compare(other, exported, pictures).max_difference["masks"] > 1e-3
+    assert parity.compare(other, exported, images).max_difference["masks"] > 1e-3
     other.roi_heads.box_predictor.cls_score.weight.data.mul_(3)
     with pytest.raises(ExportError, match="finds other objects than torch"):
-        parity.compare(other, exported, pictures).require(exported)
+        parity.compare(other, exported, images).require(exported)
 
 
 def test_ambiguous_images_are_skipped_and_few(opinionated):
-    """A network whose threshold is the score of something it finds differs from itself, an ordinary
-    one does not.
-    """
-    (picture,) = draw_samples(1)
+    """A network whose threshold equals a detection's score is ambiguous; another is not."""
+    (image,) = draw_samples(1)
 
     def found_by(detector):
         with torch.inference_mode():
-            return [tensor.numpy()[0] for tensor in detector(torch.from_numpy(picture)[None])]
+            return [tensor.numpy()[0] for tensor in detector(torch.from_numpy(image)[None])]
 
     sure, edge = Detector(opinionated), Detector(copy.deepcopy(opinionated))
     found = found_by(sure)
-    assert not parity._is_ambiguous(sure, picture, found)
+    assert not parity._is_ambiguous(sure, image, found)
     at = float(found[2][int(found[-1]) - 1])
     edge.network.config = dataclasses.replace(opinionated.config, score_threshold=at)
-    assert parity._is_ambiguous(edge, picture, found_by(edge))
+    assert parity._is_ambiguous(edge, image, found_by(edge))
     few = parity.Parity(images=7) | parity.Parity(images=1, ambiguous=1)
     few.require("m.onnx")
     with pytest.raises(
@@ -435,8 +429,9 @@ def test_a_broken_contract_is_named(exported, tmp_path, break_it, message):
 
 def test_the_segmenter_never_imports_torch(exported):
     code = (
-        "import sys, numpy as np; from pathlib import Path; from cohdc_train.segmenter import Segmenter;"
-        f"print(len(Segmenter(Path({str(exported)!r}))(np.zeros((60, 80, 3), np.uint8)).boxes) >= 0);"
+        "import sys, numpy as np; from cohdc_train.segmenter import Segmenter;"
+        f"found = Segmenter({str(exported)!r})(np.zeros((60, 80, 3), np.uint8));"
+        "print(len(found) >= 0);"
         "print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

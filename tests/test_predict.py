@@ -1,6 +1,4 @@
-"""`cohdc predict` with a network that answers from the image's brightness: files, filters, drawing,
-readers.
-"""
+"""`cohdc predict` with a fake segmenter: files, filters, drawing, readers."""
 
 import json
 from pathlib import Path
@@ -25,9 +23,7 @@ BOXES = np.array(
 
 
 class Fake:
-    """Finds three objects in every image: an oval with a hole, an oval, and one whose mask is
-    empty.
-    """
+    """Segmenter that finds an oval with a hole, an oval, and an object with an empty mask."""
 
     class_names = ("person", "car")
 
@@ -42,19 +38,19 @@ class Fake:
         return Detections(BOXES, labels, scores, quality, masks, (height, width), self.class_names)
 
 
-def picture(name: str = "room") -> SourceImage:
+def make_image(name: str = "room") -> SourceImage:
     rgb = np.random.default_rng(1).integers(0, 80, (100, 120, 3), np.uint8)
     return SourceImage(f"{name}.png", name, rgb)
 
 
 def test_coco_file_holds_what_was_found(tmp_path: Path) -> None:
-    pictures = [picture("a"), picture("b")]
-    result = predict_images(pictures, Fake(), tmp_path / "new" / "out")
+    images = [make_image("a"), make_image("b")]
+    result = predict_images(images, Fake(), tmp_path / "new" / "out")
     assert json.loads((tmp_path / "new" / "out" / "predictions.json").read_text()) == result
     assert [image["file_name"] for image in result["images"]] == ["a.png", "b.png"]
     assert result["categories"] == [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}]
     first, second, *_ = result["annotations"]
-    assert len(result["annotations"]) == 4, "the object without pixels is left out"
+    assert len(result["annotations"]) == 4, "the object without pixels is skipped"
     assert (first["category_id"], first["category"], second["category_id"]) == (1, "person", 2)
     assert first["bbox"] == [20, 10, 40, 80]
     assert second["score"] == pytest.approx(0.6)
@@ -68,7 +64,7 @@ def test_coco_file_holds_what_was_found(tmp_path: Path) -> None:
 
 
 def test_polygons_keep_the_floor(tmp_path: Path) -> None:
-    one = picture()
+    one = make_image()
     result = predict_images([one], Fake(), tmp_path, PredictOptions(iou_floor=0.9))
     for annotation, mask in zip(result["annotations"], Fake()(one.rgb).masks()[:2], strict=True):
         rings = [Polygon(np.reshape(ring, (-1, 2))) for ring in annotation["segmentation"]]
@@ -82,7 +78,7 @@ def test_polygons_keep_the_floor(tmp_path: Path) -> None:
 )  # pycocotools under numpy 2
 def test_pycocotools_loads_the_file(tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools comes with the train extra")
-    one = picture()
+    one = make_image()
     predict_images([one], Fake(), tmp_path, PredictOptions(iou_floor=1.0, contour="bisection"))
     loaded = coco.COCO(str(tmp_path / "predictions.json"))
     masks = [
@@ -99,29 +95,29 @@ def test_pycocotools_loads_the_file(tmp_path: Path) -> None:
 def test_score_and_quality_filter(
     tmp_path: Path, least: tuple[float, float | None], left: list[float]
 ) -> None:
-    result = predict_images([picture()], Fake(), tmp_path, PredictOptions(*least))
+    result = predict_images([make_image()], Fake(), tmp_path, PredictOptions(*least))
     assert [annotation["score"] for annotation in result["annotations"]] == pytest.approx(left)
     assert (tmp_path / "room_overlay.jpg").is_file()
 
 
-def test_drawing_colours_the_masks_only(tmp_path: Path) -> None:
-    one = picture()
+def test_drawing_colors_the_masks_only(tmp_path: Path) -> None:
+    one = make_image()
     found = Fake()(one.rgb).select(np.array([False, True, False]))
     drawn = draw_detections(one.rgb, found, [[]])
     mask = found.masks()[0]
     untouched = ~mask
     untouched[: int(BOXES[1, 1]) + 2, 60:] = False  # the text
     assert np.array_equal(drawn[untouched], one.rgb[untouched])
-    assert (drawn[mask][:, 0] > one.rgb[mask][:, 0] + 30).mean() > 0.9, "the first colour is red"
+    assert (drawn[mask][:, 0] > one.rgb[mask][:, 0] + 30).mean() > 0.9, "the first color is red"
 
 
 def test_folder_is_read_in_order_and_overlays_do_not_collide(tmp_path: Path) -> None:
-    for name, grey in [("b.png", 1), ("a.jpg", 2), ("a.png", 3)]:
-        cv2.imwrite(str(tmp_path / name), np.full((8, 8, 3), grey, np.uint8))
+    for name, gray in [("b.png", 1), ("a.jpg", 2), ("a.png", 3)]:
+        cv2.imwrite(str(tmp_path / name), np.full((8, 8, 3), gray, np.uint8))
     (tmp_path / "notes.txt").write_text("no image")
-    pictures = list(read_images(tmp_path))
-    assert [one.name for one in pictures] == ["a.jpg", "a.png", "b.png"]
-    assert [one.stem for one in pictures] == ["a.jpg", "a.png", "b"]
+    images = list(read_images(tmp_path))
+    assert [one.name for one in images] == ["a.jpg", "a.png", "b.png"]
+    assert [one.stem for one in images] == ["a.jpg", "a.png", "b"]
     cv2.imwrite(str(tmp_path / "a.jpg.png"), np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "folder.jpg").mkdir()
     assert len({one.stem for one in read_images(tmp_path)}) == 4
@@ -138,8 +134,8 @@ def test_video_frames_are_read(tmp_path: Path) -> None:
     writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
     if not writer.isOpened():
         pytest.skip("this OpenCV cannot write videos")
-    for grey in (10, 120, 230):
-        writer.write(np.full((48, 64, 3), grey, np.uint8))
+    for gray in (10, 120, 230):
+        writer.write(np.full((48, 64, 3), gray, np.uint8))
     writer.release()
     frames = list(read_images(file))
     assert [frame.name for frame in frames] == [
@@ -151,7 +147,7 @@ def test_video_frames_are_read(tmp_path: Path) -> None:
 
 
 class _Webcam:
-    """In the place of OpenCV's: number 0 gives grey pictures without end, others none."""
+    """Fake of OpenCV's: number 0 gives gray images without end, others none."""
 
     released = 0
 
@@ -170,7 +166,7 @@ def test_a_webcam_is_a_number_and_has_an_end(
 ) -> None:
     monkeypatch.setattr(cv2, "VideoCapture", _Webcam)
     monkeypatch.chdir(tmp_path)
-    assert [picture.name for picture in read_images(Path("0"), 2)] == [
+    assert [image.name for image in read_images(Path("0"), 2)] == [
         "webcam0_000000.jpg",
         "webcam0_000001.jpg",
     ]

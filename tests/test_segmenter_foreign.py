@@ -1,4 +1,4 @@
-"""Graphs of other exporters, built here in their layout, are read as if they kept the contract."""
+"""Segmenter: ONNX files of other exporters, built here, are read like our own."""
 
 import cv2
 import numpy as np
@@ -19,25 +19,21 @@ PROTOTYPES = 4
 
 
 def prototypes():
-    """[P, 16, 24]: everywhere, the left half, the upper half, and nowhere, as +-8 before the
-    sigmoid.
-    """
+    """Make [P, 16, 24] logits of +-8: everywhere, the left half, the upper half, nowhere."""
     maps = np.full((PROTOTYPES, CANVAS[0] // 4, CANVAS[1] // 4), -8.0, np.float32)
     maps[0], maps[1, :, :12], maps[2, :8] = 8, 8, 8
     return maps
 
 
 def candidate(box, label, score, prototype):
-    """A column [4 + C + P]; box: cx, cy, w, h in canvas px."""
+    """Make a column [4 + C + P]; box: cx, cy, w, h in canvas px."""
     scores, coefficients = np.zeros(len(CLASSES)), np.zeros(PROTOTYPES)
     scores[label], coefficients[prototype] = score, 1
     return np.concatenate([box, scores, coefficients])
 
 
 def yolo(path, table, names=CLASSES, free=False):
-    """A file whose candidates' boxes, scores and coefficients are `table` times the mean of the
-    image's red channel.
-    """
+    """Write a file whose candidates are `table` times the mean of the image's red channel."""
     table = np.asarray(table, np.float32)
     factor = np.ones_like(table)  # 1 where the table stands as it is
     if table.shape[0] == 4 + len(CLASSES) + PROTOTYPES:
@@ -122,7 +118,7 @@ def test_yolo_takes_red_first_and_halves_of_255(tmp_path):
 
 @pytest.mark.parametrize("size", [(200, 200), (50, 300), (64, 64)])
 def test_yolo_letterbox_is_undone(tmp_path, size):
-    """A candidate that covers the content is the whole image; beyond it nothing reaches."""
+    """A candidate that covers the content is the whole image, clipped to it."""
     height, width = size
     scale = min(CANVAS[0] / height, CANVAS[1] / width)
     table = columns(
@@ -220,7 +216,7 @@ def test_an_image_to_image_graph_is_no_segmenter(tmp_path, shape):
 
 @pytest.fixture(scope="module")
 def torchvisions(opinionated):
-    """Torchvision's own detector around the small network's parts."""
+    """Make torchvision's own detector from the small network's parts."""
     backbone, heads = opinionated.backbone, opinionated.roi_heads
     backbone.out_channels = opinionated.config.fpn_channels
     return TorchvisionMaskRCNN(

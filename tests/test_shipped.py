@@ -1,6 +1,4 @@
-"""The networks that come with the package: named, small, described by their cards, and they find
-people.
-"""
+"""Shipped networks: named, small, described by their cards, and they find people."""
 
 import json
 import re
@@ -58,13 +56,13 @@ def test_the_card_tells_the_stored_figures(name: str, size: str) -> None:
     }
     told = {key: float(rows[name]) for name, key in names.items()}
     assert told == {key: pytest.approx(stored["int8"][key], abs=5e-4) for key in names.values()}
-    for word in ("Licence", "COCO", "ImageNet", f"tools/experiments/person_model.py {size}"):
+    for word in ("License", "COCO", "ImageNet", f"tools/experiments/person_model.py {size}"):
         assert word in card
 
 
 @pytest.mark.parametrize("name", CANVASES)
 def test_it_finds_the_people_of_walking_xyz(name: str) -> None:
-    """Two in each photograph; the sixteenth is cut by the picture's edge."""
+    """Two people are in each photograph; the sixteenth is cut by the image's edge."""
     if not PHOTOS.is_dir():
         pytest.skip("needs TUM's photographs beside the repository")
     segmenter = Segmenter(Path(name), num_threads=1)

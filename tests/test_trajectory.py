@@ -1,6 +1,4 @@
-"""Trajectory files and scores: known answers, invariances, the stored walking estimates, agreement
-with evo.
-"""
+"""Trajectory files and scores: known answers, invariances, agreement with evo."""
 
 import importlib.util
 import json
@@ -32,7 +30,7 @@ from cohdc_train.trajectory.trajectory import Trajectory
 
 TUM = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum"
 needs_tum = pytest.mark.skipif(not TUM.is_dir(), reason=f"{TUM} is absent")
-WALKING = {  # ATE RMSE in metres, from the data's README
+WALKING = {  # ATE RMSE in meters, from the data's README
     "walking_xyz_a": 0.0144,
     "walking_xyz_b": 0.0159,
     "walking_xyz_c": 0.0202,
@@ -55,9 +53,7 @@ def rigid(rng: np.random.Generator) -> NDArray[np.float64]:
 def wander(
     rng: np.random.Generator, n: int = 40, rate: float = 10.0, noise: float = 0.0
 ) -> Trajectory:
-    """A smooth walk of the camera; with `noise` every pose is disturbed by that many metres and
-    radians.
-    """
+    """Make a smooth walk; `noise` disturbs each pose by that many meters and radians."""
     time = np.arange(n) / rate
     phases = np.arange(3)
     poses = np.tile(np.eye(4), (n, 1, 1))
@@ -379,9 +375,11 @@ for truth, estimate in zip(sys.argv[2::2], sys.argv[3::2]):
     pair = [file_interface.read_tum_trajectory_file(name) for name in (truth, estimate)]
     truth, estimate = sync.associate_trajectories(*pair, max_diff=0.02)
     row = {}
-    relations = {"m": metrics.PoseRelation.translation_part, "deg": metrics.PoseRelation.rotation_angle_deg}
+    angle = metrics.PoseRelation.rotation_angle_deg
+    relations = {"m": metrics.PoseRelation.translation_part, "deg": angle}
+    step = {"delta": int(sys.argv[1]), "delta_unit": metrics.Unit.frames, "all_pairs": True}
     for unit, relation in relations.items():
-        rpe = metrics.RPE(relation, delta=int(sys.argv[1]), delta_unit=metrics.Unit.frames, all_pairs=True)
+        rpe = metrics.RPE(relation, **step)
         rpe.process_data((truth, estimate))
         row["rpe_" + unit] = rpe.get_all_statistics()
     estimate.align(truth)
@@ -397,7 +395,7 @@ needs_evo = pytest.mark.skipif(
 
 
 def evo_says(home: Path, delta: int, files: list[Path]) -> list[dict[str, dict[str, float]]]:
-    """Ask evo, which is GPL and therefore only ever runs in a process of its own."""
+    """Ask evo, which is GPL and therefore runs in a process of its own."""
     environment = {**os.environ, "HOME": str(home), "MPLBACKEND": "Agg"}
     command = [sys.executable, "-c", EVO, str(delta), *map(str, files)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
@@ -434,8 +432,8 @@ def test_evo_agrees_on_the_stored_walking_estimates(tmp_path: Path) -> None:
     ):
         matched = match(Trajectory.load_tum(truth), Trajectory.load_tum(estimate))
         start = np.arange(len(matched[0]) - 30)
-        metres, degrees = rpe(*matched, np.stack([start, start + 30], axis=1))
-        ours = {"ate_m": ate(*matched), "rpe_m": metres, "rpe_deg": degrees}
+        meters, degrees = rpe(*matched, np.stack([start, start + 30], axis=1))
+        ours = {"ate_m": ate(*matched), "rpe_m": meters, "rpe_deg": degrees}
         for key, errors in ours.items():
             six = statistics(errors)
             assert six == pytest.approx({name: evo[key][name] for name in six}, abs=1e-6), (

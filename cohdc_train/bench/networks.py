@@ -1,4 +1,4 @@
-"""`cohdc bench networks`: one row of Table 4 per network, all trained and timed alike (no torch)."""
+"""`cohdc bench networks`: the paper's Table 4, all networks trained and timed alike."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +37,7 @@ class NetworkBenchOptions:
     int8: bool = True
 
     def __post_init__(self) -> None:
+        """Check the ranges."""
         if min(self.threads, self.images) < 1:
             raise CohdcError(
                 f"threads is {self.threads} and images is {self.images}; both are at least 1"

@@ -96,7 +96,7 @@ def row_config(row: str) -> Path:
 
 
 def score_model(model: Path, data: Path, out: Path, options: NetworkBenchOptions) -> ScoredNetwork:
-    """Score a finished model: an ONNX file as it is, or a checkpoint, which is exported below `out`.
+    """Score a finished model: an ONNX file, or a checkpoint, which is exported below `out`.
 
     Raises:
         CohdcError: there is no such file, or a step failed.

@@ -1,4 +1,4 @@
-"""`cohdc bench table3`: the paper's Table 3 at a stated scale, measured next to published scores."""
+"""`cohdc bench table3`: the paper's Table 3 at any scale, next to the published scores."""
 
 import json
 from dataclasses import dataclass
@@ -33,6 +33,7 @@ class Table3Scale:
     options: list[str] | None = None
 
     def __post_init__(self) -> None:
+        """Check the ranges."""
         for name in ("epochs_scale", "size_scale"):
             if not getattr(self, name) > 0:
                 raise DataError(f"{name} is {getattr(self, name):g}; it must be above 0")

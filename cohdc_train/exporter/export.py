@@ -32,6 +32,7 @@ class ExportOptions:
     verify_only: bool = False
 
     def __post_init__(self) -> None:
+        """Check that int8 can be scored."""
         if self.int8 is not None and self.data is None and not self.allow_drop:
             raise CohdcError(
                 f"{self.int8}: int8 needs --data, whose AP tells what it loses, or --allow-drop"

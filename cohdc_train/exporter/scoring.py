@@ -17,6 +17,7 @@ class ValidationScorer:
     """
 
     def __init__(self, module: MaskRCNNModule, data: Path, checkpoint: Path) -> None:
+        """Open the folder with the classes of the checkpoint."""
         self._module = module
         self._data = validation_data(data, checkpoint, module.class_names)
 

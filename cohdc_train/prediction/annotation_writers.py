@@ -131,6 +131,7 @@ class CocoWriter:
     """Writer of predictions.json."""
 
     def __init__(self, out: Path) -> None:
+        """Write into a folder."""
         self._out = out
 
     def write_image(self, image: SourceImage, result: ImageDetections) -> None:
@@ -151,6 +152,7 @@ class LabelmeWriter:
     def __init__(
         self, out: Path, own: OwnFiles, class_names: tuple[str, ...], check_below: float
     ) -> None:
+        """Write into a folder; mark contours whose quality is below `check_below`."""
         self._out = out
         self._own = own
         self._class_names = class_names
@@ -235,6 +237,7 @@ class YoloWriter:
     """
 
     def __init__(self, out: Path, own: OwnFiles, class_names: tuple[str, ...]) -> None:
+        """Write into a folder, and make labels/ in it."""
         self._out = out
         self._own = own
         self._class_names = class_names

@@ -36,6 +36,7 @@ class PredictOptions:
     frames: int | None = None
 
     def __post_init__(self) -> None:
+        """Check the ranges."""
         for name in ("score", "quality", "iou_floor", "check_below"):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:

@@ -2,8 +2,8 @@
 
 | adapter | input, RGB in 0..1 | outputs |
 |---|---|---|
-| `YoloSeg` | float [1, 3, S, S], centered on gray | candidates, prototypes [1, P, h, w] |
-| `TorchvisionMaskRCNN` | float [3, H, W] | boxes [n, 4], labels [n], scores [n], masks [n, 1, H, W] |
+| `YoloSeg` | [1, 3, S, S], centered on gray | candidates, prototypes [1, P, h, w] |
+| `TorchvisionMaskRCNN` | [3, H, W] | boxes [n, 4], labels [n], scores [n], masks [n, 1, H, W] |
 
 Candidates are [1, 4 + C + P, n]: box cx, cy, w, h in canvas px, class scores, mask coefficients.
 Networks with NMS inside give [1, n, 6 + P]: box x0, y0, x1, y1, score, class, mask coefficients.
@@ -47,6 +47,7 @@ class YoloSeg:
     """Adapter of one-stage segmenters with mask prototypes, as YOLO-seg networks are exported."""
 
     def __init__(self, path: Path, session: Any, metadata: dict[str, str]) -> None:
+        """Read the sizes and class names of a file."""
         self._session = session
         candidates, prototypes = _outputs_by_rank(session)
         self._outputs = [candidates.name, prototypes.name]
@@ -97,6 +98,7 @@ class TorchvisionMaskRCNN:
     """Adapter of torchvision's Mask R-CNN, as torch's tracing exporter writes it."""
 
     def __init__(self, path: Path, session: Any, metadata: dict[str, str]) -> None:
+        """Read the sizes and class names of a file."""
         self._session = session
         rows, columns = session.get_inputs()[0].shape[1:]
         is_fixed = isinstance(rows, int) and isinstance(columns, int)

@@ -36,6 +36,7 @@ class Detections:
     class_names: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        """Check the shapes."""
         n = len(self.boxes)
         expected = {"boxes": (n, 4), "labels": (n,), "scores": (n,), "quality": (n,)}
         for name, shape in expected.items():

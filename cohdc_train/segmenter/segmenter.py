@@ -49,6 +49,7 @@ class Segmenter:
     """
 
     def __init__(self, model: str | Path, num_threads: int = 0) -> None:
+        """Load the file and choose its adapter."""
         path = model_path(model)
         session = open_session(path, num_threads)
         metadata: dict[str, str] = session.get_modelmeta().custom_metadata_map
@@ -106,6 +107,7 @@ class CohdcModel:
     """
 
     def __init__(self, path: Path, session: Any, metadata: dict[str, str]) -> None:
+        """Read the canvas and class names of a file."""
         _check_contract(path, session, metadata)
         self._session = session
         self.class_names: tuple[str, ...] = tuple(json.loads(metadata[signature.KEY_CLASSES]))

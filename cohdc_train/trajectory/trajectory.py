@@ -34,6 +34,7 @@ class Trajectory:
     poses: FloatArray
 
     def __post_init__(self) -> None:
+        """Convert to float64 arrays and check them."""
         timestamps = np.asarray(self.timestamps, np.float64)
         poses = np.asarray(self.poses, np.float64)
         object.__setattr__(self, "timestamps", timestamps)

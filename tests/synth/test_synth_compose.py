@@ -13,7 +13,7 @@ import yaml
 from cohdc_train.cli import main
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.tum import Entry
-from cohdc_train.synth.compose import (
+from cohdc_train.synth.cut_outs import (
     RELIEF_M,
     CutOut,
     WalkPath,

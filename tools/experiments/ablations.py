@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""Ablations of the network: HDC's rates on the same weights, and the CQE head's fusions, targets
-and uses.
+"""Ablations of the network: HDC's rates, and the CQE head's fusions, targets and uses.
 
     tools/experiments/ablations.py hdc --data ROOT [ROOT ...] --out DIR [--seeds 0 1 2] [--jobs 2]
         [-- OPTIONS OF cohdc fit]
