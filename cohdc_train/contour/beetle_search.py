@@ -10,30 +10,30 @@ from cohdc_train.contour.polygon_iou import IoUEvaluator
 from cohdc_train.contour.polygons import Polygon, count_vertices
 from cohdc_train.types import FloatArray, IntArray
 
-_MAX_VERTICES = 2000  # behind bisection; an outline of more is kept as it is
-_AT_A_TIME = 8  # at first, of so many vertices one is dropped
-_LONG = 6  # vertices of a ring of which at least three are left when every other one is dropped
-_DENSE = 10  # of an outline with many vertices one of so many is tried before the search ends
-_ROOM = 0.35  # of the shorter of its edges: further no vertex moves at a time
+_MAX_VERTICES = 2000  # after bisection; an outline of more is not searched
+_DROP_ONE_OF = 8  # vertices, at first
+_LONG = 6  # vertices of a ring that keeps three when every other one is dropped
+_TRY_ONE_OF = 10  # vertices, before the search ends
+_ROOM = 0.35  # of its shorter edge: longest move of a vertex
 
 
 @dataclass(frozen=True)
 class BeetleSearch:
     """Parameters of the beetle antennae search, named as the paper names them.
 
+    The paper's k, the number of parameters, is 2 for every beetle: a vertex. All beetles together
+    have twice the number of vertices.
+
     Attributes:
-        S: step, the length of the first move behind a dropped vertex, px.
+        S: step, the length of the first move after a vertex was dropped, px.
         H: attenuation of the step with every move.
         c: ratio of the step to the whiskers' length d_0 = S / c.
-        n: most moves behind a dropped vertex; when they do not lead back to the floor, the vertex
-            stays.
+        n: largest number of moves after a vertex was dropped; when they do not lead back to the
+            floor, the vertex stays.
         pairs: whiskers of a beetle, in pairs of opposite directions; the paper's has one.
-        tries: vertices that are tried before the search ends, those that are missed least first;
-            more of an outline with many.
+        tries: vertices that are tried before the search ends, the cheapest first; more of an
+            outline with many.
         seed: of the random directions.
-
-    The paper's k, the number of parameters, is 2 for every beetle: a vertex. All of them together
-    have twice the vertices.
     """
 
     S: float = 3.0
@@ -46,21 +46,27 @@ class BeetleSearch:
 
     @property
     def steps(self) -> list[float]:
-        """The length of every move, px."""
+        """Length of every move, px."""
         return [self.S * self.H**k for k in range(self.n)]
 
 
 def search_vertices(
     finer: list[Polygon], iou_floor: float, evaluator: IoUEvaluator, search: BeetleSearch
 ) -> list[Polygon]:
-    """Drop vertices and move the others while the floor is kept.
+    """Drop vertices and move the others while the floor of the IoU is kept.
 
-    Of an outline with many vertices several go at a time, until that fails. When not one can be
-    dropped, all move for a higher IoU. Then there is another round, which ends the search when it
-    drops nothing.
+    Of an outline with many vertices several are dropped together, until that fails. When no vertex
+    can be dropped, all move for a higher IoU. Then there is another round, which ends the search
+    when it drops nothing.
 
-    finer: polygons that keep the floor. Returns the last ones that keep it and do not cross
-    themselves.
+    Args:
+        finer: polygons that keep the floor.
+        iou_floor: smallest IoU, 0..1.
+        evaluator: compares polygons with the outline.
+        search: parameters.
+
+    Returns:
+        The last polygons that keep the floor and do not cross themselves.
     """
     if count_vertices(finer) > _MAX_VERTICES:
         return finer
@@ -76,12 +82,12 @@ def search_vertices(
                 return fewer
         return None
 
-    while (count := swarm.count // _AT_A_TIME) > 1 and (
+    while (count := swarm.count // _DROP_ONE_OF) > 1 and (
         fewer := without_one_of(swarm.joint_removals(count))
     ):
         swarm = fewer
     while True:
-        tries = 1 if moved else max(search.tries, swarm.count // _DENSE)
+        tries = 1 if moved else max(search.tries, swarm.count // _TRY_ONE_OF)
         if fewer := without_one_of(swarm.cheapest_removals(tries)):
             swarm, moved = fewer, False
             continue
@@ -92,26 +98,25 @@ def search_vertices(
 
 
 class _VertexSwarm:
-    """The vertices of all rings, each the head of a beetle.
+    """Vertices of all rings, each the head of a beetle.
 
     A beetle's f is what its two edges add to the pixels that only one of outline and polygons has.
-    Neighbors do not move at the same time, so that the sum falls by what each of them gains.
+    Neighbors do not move together, so that the sum falls by what each of them gains.
     """
 
     def __init__(self, polygons: list[Polygon], evaluator: IoUEvaluator, pairs: int) -> None:
         rings = [ring for polygon in polygons for ring in polygon.rings]
         self._evaluator = evaluator
         self._spread = np.arange(pairs)[:, None] * np.pi / pairs
-        self._owner = np.array(
-            [k for k, polygon in enumerate(polygons) for _ in polygon.rings]
-        )  # of every ring
+        owners = [k for k, polygon in enumerate(polygons) for _ in polygon.rings]
+        self._owner = np.array(owners)  # polygon of every ring
         self._sizes = np.array([len(ring) for ring in rings])
         self._x = np.concatenate(rings)  # [V, 2]
         self._link()
         _, self._apart = evaluator.count_pixels(*self._edges())
 
     def _link(self) -> None:
-        """Neighbors of every vertex, its place in its ring and the ring's size."""
+        """Set the neighbors of every vertex, its place in its ring and the ring's size."""
         ends = np.cumsum(self._sizes)
         starts = ends - self._sizes
         index = np.arange(len(self._x))
@@ -122,22 +127,23 @@ class _VertexSwarm:
 
     @property
     def count(self) -> int:
-        """How many vertices there are."""
+        """Number of vertices."""
         return len(self._before)
 
     def _edges(self) -> tuple[FloatArray, FloatArray]:
         return self._x, self._x.take(self._after, axis=0)
 
     def _turns(self, first: int) -> list[IntArray]:
-        """Two sets without neighbors among them; of an odd ring one vertex is in none, another for
-        every `first`.
+        """Return two sets of vertices without neighbors among them.
+
+        Of an odd ring one vertex is in neither; another one for every `first`.
         """
         place = (self._place + first) % self._size
         odd = place % 2 == 1
         return [np.flatnonzero(odd), np.flatnonzero(~odd & (place < self._size - 1))]
 
     def _f(self, index: IntArray, heads: FloatArray) -> IntArray:
-        """f of beetles [m] with their heads at [p, m, 2]: [p, m]."""
+        """Return f of beetles [m] with their heads at [p, m, 2]: [p, m]."""
         start, end = np.empty((2, 2, *heads.shape))  # [edge, p, m, 2]
         start[0] = self._x.take(self._before.take(index), axis=0)
         start[1] = self._x.take(self._after.take(index), axis=0)
@@ -149,13 +155,17 @@ class _VertexSwarm:
         return f
 
     def move(self, step: float, whisker: float, first: int, rng: np.random.Generator) -> None:
-        """One move of every beetle by equation 2; a head goes to the best of the places that were
-        felt.
+        """Move every beetle once by equation 2; a head goes to the best place that was probed.
 
-        step: length of the move, px; whisker: d_0, px; both are shorter where edges are short, so
-        that rings cross less often. first: where the first turn begins. The equation's second line
-        has `step` where the right whisker stands; both are d_0 long here. The paper's head walks on
-        from a worse place too, this one stays.
+        Step and whisker are shorter where edges are short, so that rings cross less often. The
+        equation's second line has `step` where the right whisker stands; both are d_0 long here.
+        The paper's head also moves to a worse place, this one stays.
+
+        Args:
+            step: length of the move, px.
+            whisker: d_0, px.
+            first: where the first turn begins.
+            rng: random directions.
         """
         start, end = self._edges()
         along = np.hypot(*(end - start).T)
@@ -184,23 +194,23 @@ class _VertexSwarm:
     def move_until_valid(
         self, iou_floor: float, search: BeetleSearch, rng: np.random.Generator
     ) -> bool:
-        """Move until the floor is kept; False when it is not after n moves, or will not be as far
-        as one can tell.
+        """Move until the floor is kept, and return whether it is.
+
+        Ends after n moves, or when the last moves show that the floor will not be reached.
         """
         ious = [self.approximate_iou()]
         for k, step in enumerate(search.steps):
             if ious[-1] >= iou_floor and self.iou() >= iou_floor:
                 return True
-            if (
-                k > 1 and 2 * ious[-1] - ious[-3] < iou_floor
-            ):  # moves to come are worth less than the last two
+            # the next moves gain less than the last two
+            if k > 1 and 2 * ious[-1] - ious[-3] < iou_floor:
                 return False
             self.move(step, step / search.c, k, rng)
             ious.append(self.approximate_iou())
         return ious[-1] >= iou_floor and self.iou() >= iou_floor
 
     def moved(self, search: BeetleSearch, rng: np.random.Generator) -> "_VertexSwarm":
-        """The same after n / 2 moves."""
+        """Return a copy after n / 2 moves."""
         other = copy(self)
         other._x = self._x.copy()
         for k, step in enumerate(search.steps[::2]):
@@ -208,11 +218,10 @@ class _VertexSwarm:
         return other
 
     def cheapest_removals(self, most: int) -> list[tuple[IntArray, int]]:
-        """Vertices that may be dropped, and what that adds to the sum; first what is missed least
-        for its number.
+        """Return the vertices to drop, the cheapest first, and what each adds to the sum.
 
-        One by one, but for triangles: as a whole, if they are no outer ring with holes nor the last
-        outer ring.
+        They are dropped one by one. Triangles are dropped as a whole, unless they are an outer ring
+        with holes or the last outer ring.
         """
         start, end = self._edges()
         ends = np.cumsum(self._sizes)
@@ -235,8 +244,9 @@ class _VertexSwarm:
         ]
 
     def joint_removals(self, count: int) -> list[tuple[IntArray, int]]:
-        """`count` vertices to drop at a time, least missed and no neighbors, and what that adds;
-        none if too few.
+        """Return `count` vertices to drop together, and what that adds to the sum; none if too few.
+
+        They are the cheapest ones without neighbors among them.
         """
         chosen: list[int] = []
         total, near = 0, set[int]()
@@ -251,7 +261,7 @@ class _VertexSwarm:
         return []
 
     def _is_removable(self, ring: int) -> bool:
-        """Whether a ring may go as a whole."""
+        """Return whether a ring may be dropped as a whole."""
         owner = self._owner
         if ring and owner[ring - 1] == owner[ring]:
             return True
@@ -260,8 +270,9 @@ class _VertexSwarm:
         )
 
     def without(self, dropped: IntArray, added: int) -> "_VertexSwarm":
-        """All but some vertices, and all but rings that have none left. added: to the sum, as
-        `least_missed` has it.
+        """Return a copy without some vertices, and without rings that have none left.
+
+        added: what that adds to the sum, as `cheapest_removals` gives it.
         """
         fewer = copy(self)
         sizes = self._sizes - np.bincount(
@@ -277,19 +288,17 @@ class _VertexSwarm:
         return fewer
 
     def iou(self) -> float:
-        """With the outline, 0..1."""
+        """Return the IoU with the outline, 0..1."""
         return self._evaluator.iou_of_edges(*self._edges())
 
     def approximate_iou(self) -> float:
-        """The same from what f has added up to and the rings' areas, not their pixels: a fifth of
-        the time.
-        """
+        """Return the IoU from the sum of f and the rings' areas, in a fifth of the time."""
         start, end = self._edges()
         twice = float(np.vdot(start[:, 0], end[:, 1]) - np.vdot(start[:, 1], end[:, 0]))
         return self._evaluator.approximate_iou(abs(twice) / 2, self._apart)
 
     def polygons(self) -> list[Polygon]:
-        """What the beetles stand around."""
+        """Return the polygons of all rings."""
         parts: dict[int, list[FloatArray]] = {}
         ends = np.cumsum(self._sizes).tolist()
         for owner, start, end in zip(self._owner.tolist(), [0, *ends], ends, strict=False):

@@ -120,7 +120,7 @@ def test_images_turned_by_exif_are_written_as_annotated(
     assert image_of(splits, "plain").path.samefile(
         root / "plain.jpg"
     )  # annotated on the unturned pixels
-    assert "       2  image turned as its EXIF says, and written anew: " in capsys.readouterr().out
+    assert "       2  image turned as its EXIF says, and written again: " in capsys.readouterr().out
     assert main(["data", "doctor", str(tmp_path / "source_coco")]) == 0
 
 
