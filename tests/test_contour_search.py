@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cohdc_train.contour import BeetleSearch, Polygon, count_vertices, rasterize, simplify, trace
-from cohdc_train.contour.beetle_search import _VertexSwarm
 from cohdc_train.contour.polygon_iou import IoUEvaluator, rings_cross
 from cohdc_train.contour.tolerance_search import ToleranceBracket
+from cohdc_train.contour.vertex_swarm import VertexSwarm
 
 SIZE = (96, 128)
 
@@ -62,7 +62,7 @@ def test_vertices_that_move_together_are_no_neighbors(sizes: list[int], first: i
         angle = np.arange(size) * 2 * np.pi / size
         rings.append(np.stack([10 + 20 * k + 8 * np.cos(angle), 10 + 8 * np.sin(angle)], axis=1))
     polygons = [Polygon(ring) for ring in rings]
-    swarm = _VertexSwarm(polygons, IoUEvaluator(polygons), pairs=4)
+    swarm = VertexSwarm(polygons, IoUEvaluator(polygons), pairs=4)
     moved = set()
     for k in range(max(sizes)):
         for index in swarm._turns(first + k):
@@ -80,7 +80,7 @@ def test_sum_of_f_counts_differing_pixels(radius: float, seed: int) -> None:
     mask, rng = two_discs(radius), np.random.default_rng(seed)
     outline = trace(mask)
     evaluator = IoUEvaluator(outline)
-    swarm = _VertexSwarm(simplify(outline, 0.97), evaluator, pairs=4)
+    swarm = VertexSwarm(simplify(outline, 0.97), evaluator, pairs=4)
     for k, together in enumerate((3, 1, 2)):
         swarm.move(2.0, (2.0, 1.0)[k % 2], k, rng)
         choices = swarm.joint_removals(together) if together > 1 else swarm.cheapest_removals(1)

@@ -5,7 +5,7 @@ Points are (x, y) in px with the origin at the corner of the first pixel, as COC
 (even-odd rule over all rings).
 """
 
-from cohdc_train.contour.beetle_search import BeetleSearch
+from cohdc_train.contour.beetle_parameters import BeetleSearch
 from cohdc_train.contour.polygons import (
     Polygon,
     count_vertices,

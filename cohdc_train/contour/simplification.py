@@ -8,7 +8,8 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from cohdc_train.contour.beetle_search import BeetleSearch, search_vertices
+from cohdc_train.contour.beetle_parameters import BeetleSearch
+from cohdc_train.contour.beetle_search import search_vertices
 from cohdc_train.contour.polygon_iou import IoUEvaluator
 from cohdc_train.contour.polygons import Polygon, count_vertices
 from cohdc_train.contour.tolerance_search import ToleranceBracket

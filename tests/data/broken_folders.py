@@ -62,11 +62,11 @@ def _jpeg(turned: int = 1, mode: str = "RGB", cut: int = 0) -> Change:
 
     def change(content: dict[str, Any], root: Path) -> None:
         row = content["images"][0]
-        picture = Image.open(root / "images" / row["file_name"]).convert(mode)
+        image_file = Image.open(root / "images" / row["file_name"]).convert(mode)
         row["file_name"] = "shot.jpg"
         exif = Image.Exif()
         exif[0x0112] = turned
-        picture.save(root / "images" / "shot.jpg", exif=exif, quality=95)
+        image_file.save(root / "images" / "shot.jpg", exif=exif, quality=95)
         path = root / "images" / "shot.jpg"
         path.write_bytes(path.read_bytes()[: len(path.read_bytes()) - cut])
 
@@ -78,10 +78,10 @@ def _turned_by_exif(content: dict[str, Any], root: Path) -> None:
     on their side.
     """
     row = content["images"][0]
-    picture = Image.open(root / "images" / row["file_name"]).transpose(Image.Transpose.ROTATE_90)
+    image_file = Image.open(root / "images" / row["file_name"]).transpose(Image.Transpose.ROTATE_90)
     exif = Image.Exif()
     exif[0x0112] = 6
-    picture.save(root / "images" / "shot.jpg", exif=exif)
+    image_file.save(root / "images" / "shot.jpg", exif=exif)
     row["file_name"] = "shot.jpg"
 
 

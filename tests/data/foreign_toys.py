@@ -17,7 +17,9 @@ PERSON = [5.0, 4.0, 25.0, 6.0, 22.0, 30.0, 7.0, 28.0]  # a polygon, px
 CAR = (30, 20, 54, 34)  # x0 y0 x1 y1, px
 
 
-def picture(path: Path, seed: int, size: tuple[int, int] = (HEIGHT, WIDTH), exif: int = 1) -> Path:
+def draw_image(
+    path: Path, seed: int, size: tuple[int, int] = (HEIGHT, WIDTH), exif: int = 1
+) -> Path:
     """Noise; exif: the orientation a JPEG says it has."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(0, 255, (*size, 3), dtype=np.uint8)
@@ -83,7 +85,7 @@ def labelme_file(path: Path, shapes: list[Any], image: str | None = None, **more
 
 def labelme(root: Path) -> Path:
     for seed, name in enumerate(NAMES):
-        picture(root / f"{name}.png", seed)
+        draw_image(root / f"{name}.png", seed)
         labelme_file(
             root / f"{name}.json",
             [shape("person", "polygon", PERSON), shape("car", "rectangle", [30, 20, 54, 34])],
@@ -108,7 +110,7 @@ def via(root: Path, regions: list[dict[str, Any]] | None = None) -> Path:
     """A 2.x export."""
     content = {}
     for seed, name in enumerate(NAMES):
-        picture(root / f"{name}.png", seed)
+        draw_image(root / f"{name}.png", seed)
         own = regions if regions is not None and name == "a" else person_and_car()
         content[f"{name}.png99"] = {
             "filename": f"{name}.png",
@@ -131,7 +133,7 @@ def yolo(
     write(root / "data.yaml", yaml)
     for seed, name in enumerate(NAMES):
         split = "val" if name == "d" else "train"
-        picture(root / "images" / split / f"{name}.png", seed)
+        draw_image(root / "images" / split / f"{name}.png", seed)
         x0, y0, x1, y1 = CAR
         rows = [yolo_row(0, PERSON), yolo_row(1, [x0, y0, x1, y0, x1, y1, x0, y1])]
         write(root / "labels" / split / f"{name}.txt", "\n".join(rows) + "\n")
@@ -167,7 +169,7 @@ def voc_labels(void: bool = True) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 def voc(root: Path) -> Path:
     for seed, name in enumerate(NAMES):
-        picture(root / "JPEGImages" / f"{name}.jpg", seed)
+        draw_image(root / "JPEGImages" / f"{name}.jpg", seed)
         objects, classes = voc_labels()
         palette_png(root / "SegmentationObject" / f"{name}.png", objects)
         palette_png(root / "SegmentationClass" / f"{name}.png", classes)

@@ -106,7 +106,7 @@ def test_issue_is_found_agrees_with_training_and_is_fixed(
     case = broken_folders.BROKEN[name]
     root = broken_folders.build(tmp_path / "a", name)
     before = (root / "instances_train.json").read_bytes()
-    code, found = issues(root, "--fix", str(tmp_path / "mended"))
+    code, found = issues(root, "--fix", str(tmp_path / "fixed"))
     assert case.kind in found["train"]
     errors = {kind for kind in found["train"] if ISSUE_KINDS[kind].severity == "error"}
     assert code == (1 if errors else 0)
@@ -127,7 +127,7 @@ def test_issue_is_found_agrees_with_training_and_is_fixed(
             )
         assert train_once({"root": root}) > 5
     if case.fixed:
-        assert_fixed_folder_trains(tmp_path / "mended", root)
+        assert_fixed_folder_trains(tmp_path / "fixed", root)
 
 
 def assert_fixed_folder_trains(folder: Path, root: Path) -> None:

@@ -102,12 +102,12 @@ def test_images_turned_by_exif_are_written_as_annotated(
     """Orientation 6 shows the right column first; the file's width is the picture's height."""
     root = toys.labelme(tmp_path / "source")
     shapes = [toys.shape("person", "polygon", toys.PERSON)]
-    toys.picture(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)
+    toys.draw_image(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)
     toys.labelme_file(root / "turned.json", shapes, "turned.jpg")
-    toys.picture(root / "plain.jpg", 21, exif=8)
+    toys.draw_image(root / "plain.jpg", 21, exif=8)
     toys.labelme_file(root / "plain.json", shapes, "plain.jpg")
     data = (
-        toys.picture(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
+        toys.draw_image(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
     ).read_bytes()
     toys.labelme_file(root / "inside.json", shapes, "no.jpg", imageData=embedded(data))
     splits = converted("labelme", root)

@@ -32,7 +32,7 @@ def build(format: str, root: Path, folders: dict[str, int]) -> Path:
         for _ in range(count):
             seed += 1
             name = f"{seed}.png"
-            toys.picture(root / folder / name, seed)
+            toys.draw_image(root / folder / name, seed)
             if format == "labelme":
                 shape = toys.shape("person", "polygon", toys.PERSON)
                 toys.labelme_file(root / folder / f"{seed}.json", [shape])
@@ -122,7 +122,7 @@ def test_test_images_alone_are_converted_only_on_request(tmp_path: Path, format:
 def test_labelme_files_in_another_folder_follow_split_of_images(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for i, split in enumerate(("train", "train", "val", "test")):
-        toys.picture(root / split / f"{i}.png", i)
+        toys.draw_image(root / split / f"{i}.png", i)
         shape = toys.shape("person", "polygon", toys.PERSON)
         toys.labelme_file(root / "labels" / f"{i}.json", [shape], f"../{split}/{i}.png")
     assert stems(converted("labelme", root)) == {"train": [0, 1], "val": [2]}

@@ -53,7 +53,7 @@ def test_voc_reads_colors_of_labelmap(tmp_path: Path, palette: bool) -> None:
         2: (0, 128, 0),
     }
     for seed, name in enumerate(("day/a", "night/b", "night/c")):
-        toys.picture(root / "JPEGImages" / f"{name}.png", seed)
+        toys.draw_image(root / "JPEGImages" / f"{name}.png", seed)
         for folder, values in (("SegmentationObject", objects), ("SegmentationClass", classes)):
             rgb = np.zeros((*values.shape, 3), np.uint8)
             for value, color in paints.items():
@@ -105,7 +105,7 @@ VOC_ERRORS = {
     r"SegmentationObject/a\.png: a PNG of mode I;16; a palette": lambda r: Image.fromarray(
         np.ones((toys.HEIGHT, toys.WIDTH), np.uint16)
     ).save(r / "SegmentationObject" / "a.png"),
-    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.picture(
+    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.draw_image(
         r / "JPEGImages" / "a.jpg", 1, (10, 10)
     ),
     r"labelmap\.txt:2: not name:R,G,B$": lambda r: toys.write(

@@ -41,7 +41,7 @@ def test_yolo_finds_images_by_folder_list_and_several(tmp_path: Path, layout: st
 def test_yolo_labels_in_image_folder_and_yaml_file_as_source(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for seed, split in enumerate(("train", "valid")):
-        toys.picture(root / split / "images" / "x.png", seed)
+        toys.draw_image(root / split / "images" / "x.png", seed)
         toys.write(root / split / "labels" / "x.txt", toys.yolo_row(0, toys.PERSON))
     path = toys.write(
         root / "own.yaml", "train: ../train/images\nval: ../valid/images\nnames: [person]\n"
@@ -98,7 +98,7 @@ def test_yolo_polygons_are_converted_exactly(
         root = Path(folder) / "source"
         toys.write(root / "data.yaml", "train: images/train\nval: images/val\nnames: [star]\n")
         for split in ("train", "val"):
-            toys.picture(root / "images" / split / f"{split}.png", 1, (height, width))
+            toys.draw_image(root / "images" / split / f"{split}.png", 1, (height, width))
             toys.write(
                 root / "labels" / split / f"{split}.txt",
                 " ".join(["0", *(f"{v:.9f}" for v in star.ravel())]),

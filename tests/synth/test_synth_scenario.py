@@ -161,16 +161,16 @@ def test_loop_sees_furniture_in_every_direction_and_its_first_view_again(
 ) -> None:
     atlas, camera = loop.atlas(), RenderCamera.freiburg3((96, 128))
 
-    def picture(k: int) -> RenderedView:
+    def render_frame(k: int) -> RenderedView:
         return render(loop.room.mesh, atlas, loop.room.lighting, camera, loop.poses[k])
 
-    first, half, last = (picture(k) for k in (0, 140, 299))
+    first, half, last = (render_frame(k) for k in (0, 140, 299))
     other_way, again = (
         float(np.median(np.abs(first.depth - later.depth))) for later in (half, last)
     )
     assert again < 0.1
     assert other_way > 0.25
-    for view in map(picture, range(0, 300, 40)):
+    for view in map(render_frame, range(0, 300, 40)):
         assert view.depth.max() < 6, "within the sensor's reach, or nearly"
         assert view.rgb.std() > 0.1 * view.rgb.mean()
 
