@@ -1,4 +1,4 @@
-"""A file or a folder is written whole or not at all."""
+"""Files and folders are written whole or not at all."""
 
 import json
 from pathlib import Path
@@ -48,7 +48,7 @@ def test_folders_are_whole_or_absent(tmp_path: Path) -> None:
 
 
 def fill(folder: Path, **contents: str) -> Path:
-    """A folder with files; `sub__name` is one in a folder below it."""
+    """Write a folder with files; `sub__name` is one in a folder below it."""
     for name, content in contents.items():
         file = folder / name.replace("__", "/")
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,4 @@
-"""Every foreign format becomes a folder that training reads: the same masks, nothing lost unsaid,
-or nothing at all.
-"""
+"""Conversion of other formats: exact masks, counted losses, and all or nothing."""
 
 import json
 import os
@@ -215,7 +213,7 @@ JUNK = st.sampled_from(
 
 
 def places(value: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The ways to every value inside of a JSON value."""
+    """Yield the path to every value inside a JSON value."""
     pairs = (
         value.items()
         if isinstance(value, dict)
@@ -284,5 +282,5 @@ def test_conversion_error_names_file_for_every_format(
 
 
 def seed_drawing_d(root: Path) -> int:
-    """A seed for which d.png, the fourth of four, is the validation image."""
+    """Return a seed for which d.png, the fourth of four, is the validation image."""
     return next(seed for seed in range(99) if np.random.default_rng(seed).permutation(4)[0] == 3)

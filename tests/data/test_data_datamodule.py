@@ -1,4 +1,4 @@
-"""Batches: shapes, types, ranges, and the same ones for the same seed."""
+"""Batches: shapes, types, ranges, and repeatability for a seed."""
 
 import json
 import subprocess
@@ -152,7 +152,8 @@ data = CocoDataModule(sys.argv[1], canvas=(256, 384), batch_size=1, workers=0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 torch.manual_seed(0)
 batch = next(iter(data.train_dataloader()))
-network = MaskRCNN(2, NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384)))
+config = NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384))
+network = MaskRCNN(2, config)
 losses = network.losses(batch.images.float() / 255, batch.targets)
 sum(losses.values()).backward()
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,6 +1,4 @@
-"""labelme: every shape with an inside, images inside the JSON or turned by EXIF, and every mistake
-named.
-"""
+"""labelme: shapes, images inside the JSON or turned by EXIF, and named errors."""
 
 import base64
 from pathlib import Path
@@ -99,7 +97,7 @@ def test_labelme_image_is_found_inside_json_or_in_other_folder(tmp_path: Path) -
 def test_images_turned_by_exif_are_written_as_annotated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Orientation 6 shows the right column first; the file's width is the picture's height."""
+    """Orientation 6 shows the right column first; the file's width is the image's height."""
     root = toys.labelme(tmp_path / "source")
     shapes = [toys.shape("person", "polygon", toys.PERSON)]
     toys.draw_image(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)

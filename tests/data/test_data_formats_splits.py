@@ -1,4 +1,4 @@
-"""The source's own split: kept by the names of folders and lists, and test is never trained on."""
+"""Own split of a source: kept by the names of folders and lists, without test images."""
 
 import json
 import tempfile
@@ -25,7 +25,7 @@ FOLDERS = st.sampled_from([*NAMED, *MORE])
 
 
 def build(format: str, root: Path, folders: dict[str, int]) -> Path:
-    """A number of images in each folder, numbered on, with labelme's JSON files or VIA's."""
+    """Write images into folders, numbered through, with labelme's JSON files or VIA's."""
     seed = 0
     for folder, count in folders.items():
         entries = {}
@@ -65,7 +65,7 @@ def test_own_split_is_kept_and_test_images_are_skipped(
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(["labelme", "via"]), st.dictionaries(FOLDERS, st.integers(1, 2), min_size=1))
 def test_every_test_image_is_skipped_and_counted(format: Any, folders: dict[str, int]) -> None:
-    """Whatever the mixture of folders."""
+    """It holds for any mixture of folders."""
     owners: dict[int, str] = {}
     for folder, count in folders.items():
         parts = [NAMED.get(part.lower(), "") for part in folder.split("/")]
@@ -167,7 +167,7 @@ def test_voc_counts_the_images_of_its_test_list(tmp_path: Path, capsys: Captured
 
 
 def test_voc_split_is_never_drawn_from_test_list(tmp_path: Path, capsys: Captured) -> None:
-    """As CVAT writes its lists, with a capital letter."""
+    """CVAT writes its lists with a capital letter."""
     root = toys.voc(tmp_path / "source")
     lists = root / "ImageSets" / "Segmentation"
     for name in ("train", "val"):

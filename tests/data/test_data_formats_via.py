@@ -1,4 +1,4 @@
-"""VGG Image Annotator: versions, shapes, where the class is, and every mistake named."""
+"""VGG Image Annotator: versions, shapes, class attributes, and named errors."""
 
 import json
 from pathlib import Path

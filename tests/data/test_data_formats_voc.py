@@ -1,4 +1,4 @@
-"""Pascal VOC segmentation: majorities, void, colors, names, and every mistake named."""
+"""Pascal VOC segmentation: majorities, void, colors, names, and named errors."""
 
 from pathlib import Path
 
@@ -36,12 +36,17 @@ def test_voc_class_is_majority_and_void_is_background(
     )
 
 
-LABELMAP = "# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:10,20,30::\nperson:200,10,0:head,foot:run\n"
+LABELMAP = """\
+# label:color_rgb:parts:actions
+background:0,0,0::
+car:10,20,30::
+person:200,10,0:head,foot:run
+"""
 
 
 @pytest.mark.parametrize("palette", [True, False])
 def test_voc_reads_colors_of_labelmap(tmp_path: Path, palette: bool) -> None:
-    """As CVAT writes it: no split, PNGs of colors, images of any type in sub folders."""
+    """CVAT writes no split, PNGs of colors, and images of any type in subfolders."""
     root = tmp_path / "source"
     objects, classes = toys.voc_labels()
     paints = {

@@ -1,4 +1,4 @@
-"""Geometry: whatever is drawn, boxes equal their masks' extents and masks stay on their pixels."""
+"""Geometry: boxes equal their masks' extents, and masks stay on their pixels."""
 
 import math
 
@@ -21,7 +21,7 @@ sides = st.integers(20, 120)
 
 
 def draw_image(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """An image whose red channel is 255 exactly under the mask, and the mask."""
+    """Return an image whose red channel is 255 exactly under the mask, and the mask."""
     mask = torch.zeros((height, width), dtype=torch.uint8)
     mask[height // 4 : height // 2, width // 5 : width // 2] = 1
     return torch.stack([mask * 255, mask * 0 + 40, mask * 0 + 80]), mask
@@ -124,9 +124,7 @@ def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> No
 
 
 def test_degraded_images_stay_in_value_range() -> None:
-    """All faults together, on stripes: the image is another one, blurred and darker or lighter, and
-    still an image.
-    """
+    """All faults together change striped images, which stay in 0..1."""
     torch.manual_seed(0)
     faults = photometric_augmentation(Augmentation(photometric=False, degrade=1.0))
     assert faults is not None

@@ -1,6 +1,4 @@
-"""The COCO-format set: readable by pycocotools, exact, reproducible, with splits that share
-nothing.
-"""
+"""COCO-format sets: readable by pycocotools, exact, repeatable, with disjoint splits."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Depth, instances and colors of the ray caster against what plane and sphere geometry say."""
+"""Depth, instances and colors of the ray caster against the geometry of planes and spheres."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,4 @@
-"""What a scene promises: who is seen how much, what moves and what does not, and the same bytes for
-the same seed.
-"""
+"""Scenes: visible share of actors, moving and static ones, and repeatability for a seed."""
 
 import hashlib
 import itertools
@@ -37,7 +35,7 @@ def views(scene: RenderedScene, step: int) -> list[RenderedView]:
 
 
 def people_in(scene: RenderedScene, view: RenderedView) -> float:
-    """Share of the pixels on people."""
+    """Return the share of the pixels on people."""
     return float(
         np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance].mean()
     )

@@ -1,4 +1,4 @@
-"""The RGB-D sequence: TUM's layout to the letter, and truth that agrees with the pixels."""
+"""RGB-D sequences: TUM's layout, and ground truth that agrees with the pixels."""
 
 import hashlib
 import json
@@ -114,7 +114,7 @@ def test_masks_are_the_rendered_people(folder: Path) -> None:
 
 
 def test_groundtruth_maps_depth_between_frames(folder: Path) -> None:
-    """Static pixels of the first frame, moved by groundtruth.txt, meet the depth of the last one."""
+    """Static pixels of the first frame, moved by groundtruth.txt, meet the depth of the last."""
     camera = yaml.safe_load((folder / "camera.yaml").read_text())
     K = np.array([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     truth = np.array(rows(folder / "groundtruth.txt"), dtype=float)
@@ -217,10 +217,10 @@ def test_invalid_arguments_are_refused_in_one_line(
 
 
 def test_import_of_synth_is_cheap() -> None:
-    code = "import sys, cohdc_train.synth; print([m for m in ('embreex', 'torch', 'scipy') if m in sys.modules])"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout
-        == "[]\n"
+    code = (
+        "import sys, cohdc_train.synth;"
+        "print([name for name in ('embreex', 'torch', 'scipy') if name in sys.modules])"
     )
+    command = [sys.executable, "-c", code]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert printed == "[]\n"
