@@ -8,11 +8,12 @@ import torch
 from lightning.pytorch import Trainer
 
 from cohdc_train.data.annotations import read_image
-from cohdc_train.data.coco import CocoSplit
-from cohdc_train.data.datamodule import CocoDataModule
+from cohdc_train.data.coco import CocoSplit, read_split
+from cohdc_train.data.datamodule import CocoDataModule, check_images
+from cohdc_train.data.layout import find_split
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import check_folder, claim_folder, write_json
-from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics, category_names
+from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.cli import told_in_one_line
@@ -63,11 +64,14 @@ def validate(
     if model.suffix == ".onnx":
         if canvas is not None:
             raise CohdcError(f"{model}: its canvas was fixed by cohdc export --canvas")
-        results = score_file(model, root, rescore is not False, min_quality, threads)
+        segmenter = Segmenter(model, threads)
+        split = _common_split(root, model, segmenter.class_names)
+        results = score_segmenter(segmenter, split, rescore is not False, min_quality)
     else:
         module = MaskRCNNModule.load(model, canvas)
         data = validation_data(root, model, module.class_names, batch_size, workers)
         results = score_module(module, data, rescore, min_quality, precision)
+        split = data.folder.val
     for name, value in results.scores.items():
         print(f"{name:<24}{value:.4f}")
     if out is not None:
@@ -75,7 +79,6 @@ def validate(
         write_json(out, results.scores)
     if pictures is not None:
         claim_folder(pictures, "validate", VALIDATION_FILES, "--pictures")
-        split = CocoDataModule(root, category_names(results.truth)).folder.val
         write_files(pictures, draw_validation(results, split.images))
     return results.scores
 
@@ -94,15 +97,21 @@ def validation_data(
     return data
 
 
-def _common_classes(root: Path, model: Path, names: Sequence[str]) -> list[str]:
-    """The folder's classes that an ONNX file knows too. Raises CohdcError when there is none."""
-    known = CocoDataModule(root).class_names
-    common = [name for name in known if name in names]
+def _common_split(root: Path, model: Path, names: Sequence[str]) -> CocoSplit:
+    """Read the validation split, with the classes that an ONNX file knows, too.
+
+    Raises:
+        CohdcError: there is no such class.
+        DataError: an annotation or an image cannot be used.
+    """
+    whole = read_split("val", find_split(root, "val"))
+    common = [name for name in whole.class_names if name in names]
     if not common:
-        raise CohdcError(
-            f"{model}: none of its {len(names)} classes is one of {root}: {', '.join(known)}"
-        )
-    return common
+        known = ", ".join(whole.class_names)
+        raise CohdcError(f"{model}: none of its {len(names)} classes is one of {root}: {known}")
+    split = whole.with_classes(common)
+    check_images(split)
+    return split
 
 
 def score_module(
@@ -139,9 +148,8 @@ def score_file(
     Raises CohdcError when there is no such class, ContractError and DataError for file and folder.
     """
     segmenter = Segmenter(model, threads)
-    data = CocoDataModule(root, _common_classes(root, model, segmenter.class_names))
-    data.setup("validate")
-    return score_segmenter(segmenter, data.folder.val, rescore, min_quality)
+    split = _common_split(root, model, segmenter.class_names)
+    return score_segmenter(segmenter, split, rescore, min_quality)
 
 
 def score_segmenter(

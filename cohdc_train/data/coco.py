@@ -67,6 +67,29 @@ class CocoSplit:
         )
         return replace(self, class_names=tuple(class_names), images=images)
 
+    def with_classes(self, class_names: Sequence[str]) -> "CocoSplit":
+        """Return the split with the objects of some of its classes only.
+
+        Raises:
+            DataError: no object is left.
+        """
+        kept = [name for name in self.class_names if name in class_names]
+        labels = {self.class_names.index(name) + 1: kept.index(name) + 1 for name in kept}
+        images = []
+        for image in self.images:
+            objects = [o for o in image.objects if o.label in labels]
+            relabeled = tuple(replace(o, label=labels[o.label]) for o in objects)
+            images.append(replace(image, objects=relabeled))
+        split = replace(self, class_names=tuple(kept), images=tuple(images))
+        split.check_objects()
+        return split
+
+    def check_objects(self) -> None:
+        """Raise DataError when there is no object to learn or to score."""
+        if not self.without_empty_images().images:
+            why = dict(self.dropped) or "no annotation of these classes"
+            raise DataError(f"{self.annotations}: no object to learn: {why}")
+
     def subset(self, count: int | None) -> "CocoSplit":
         """Return the split with `count` images, drawn at random but always the same; None for all.
 
@@ -210,10 +233,9 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         clipped += exceeds_image(row.get("bbox"), image)
         objects[image.id].append(build_object(row, label, segmentation, image))
     kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
-    if not any(o for image in kept for o in image.objects if not o.crowd):
-        why = dict(dropped) or "no annotation of these classes"
-        raise DataError(f"{files.annotations}: no object to learn: {why}")
-    return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
+    split = CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
+    split.check_objects()
+    return split
 
 
 def _class_map(
