@@ -62,9 +62,7 @@ def convert(
     with new_folder(out) as draft:
         found = _read(format, source, attribute, names)
         splits = _assign_splits(source, found, val, seed)
-        classes = found.class_names or sorted(
-            {o.name for images in splits.values() for i in images for o in i.objects}
-        )
+        classes = found.class_names or _class_names(splits)
         file_names = _write_images(splits.values(), draft / "images", found)
         for name, images in splits.items():
             content = _coco_content(images, file_names, classes, found)
@@ -79,6 +77,12 @@ def convert(
     _print_counts("skipped", found.skipped)
     _print_counts("worth knowing", found.notes)
     print(f"next: cohdc data doctor {out}")
+
+
+def _class_names(splits: Mapping[str, Sequence[SourceImage]]) -> list[str]:
+    """Return the names of all classes that have an object, sorted."""
+    images = [image for part in splits.values() for image in part]
+    return sorted({o.name for image in images for o in image.objects})
 
 
 def _describe_split(found: SourceDataset, val: float, seed: int) -> str:

@@ -90,11 +90,7 @@ def _categories(split: SplitReport, given: Sequence[Any]) -> tuple[list[Row], di
     first: dict[str, int] = {}
     join: dict[int, int] = {}
     for row in given:
-        if (
-            not isinstance(row, dict)
-            or not isinstance(row.get("id"), int)
-            or not str(row.get("name") or "").strip()
-        ):
+        if not _is_category(row):
             split.reject("category-broken", f"{row!r:.40}", row)
             continue
         name, number = str(row["name"]), row["id"]
@@ -119,11 +115,7 @@ def _images(
     """Return the sound images by id; and the first id of a file by each other id of it."""
     by_id: dict[Any, list[Row]] = defaultdict(list)
     for row in given:
-        if (
-            not isinstance(row, dict)
-            or not row.get("file_name")
-            or not _whole(row, "id", "width", "height")
-        ):
+        if not _is_image(row):
             split.reject("image-broken", f"{row!r:.60}", row)
         elif row not in by_id[row["id"]]:
             by_id[row["id"]].append(row)
@@ -282,5 +274,19 @@ def _note_objects(
             split.issues.add("category-unused", str(row["name"]))
 
 
-def _whole(row: Row, *keys: str) -> bool:
+def _is_category(row: Any) -> bool:
+    """Return whether a row has a whole-number id and a name."""
+    if not isinstance(row, dict) or not isinstance(row.get("id"), int):
+        return False
+    return bool(str(row.get("name") or "").strip())
+
+
+def _is_image(row: Any) -> bool:
+    """Return whether a row has a file name, and id and size as whole numbers."""
+    if not isinstance(row, dict) or not row.get("file_name"):
+        return False
+    return _are_whole(row, "id", "width", "height")
+
+
+def _are_whole(row: Row, *keys: str) -> bool:
     return all(isinstance(row.get(key), int | float) and row[key] == int(row[key]) for key in keys)
