@@ -21,6 +21,7 @@ class VertexSwarm:
     """
 
     def __init__(self, polygons: list[Polygon], evaluator: IoUEvaluator, pairs: int) -> None:
+        """Take the vertices of polygons, for beetles of `pairs` pairs of whiskers."""
         rings = [ring for polygon in polygons for ring in polygon.rings]
         self._evaluator = evaluator
         self._spread = np.arange(pairs)[:, None] * np.pi / pairs
