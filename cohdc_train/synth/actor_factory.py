@@ -43,14 +43,14 @@ class ActorFactory:
                 ways, self.times, self.poses[:, :2, 3], loop_heading(self.times)
             )
         else:
-            ways = tuple(way.transformed(0.0, EYE_Y) for way in ways)
+            ways = tuple(way.shifted(0.0, EYE_Y) for way in ways)
         return [Walker(person, way) for person, way in zip(people, ways, strict=True)]
 
     def stopping(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
         """Return people who stop and go."""
         ways = walks.stop_and_go(self.rng, self.times, distances)
         return [
-            Walker(person, way.transformed(0.0, EYE_Y))
+            Walker(person, way.shifted(0.0, EYE_Y))
             for person, way in zip(people, ways, strict=True)
         ]
 
@@ -85,7 +85,7 @@ class ActorFactory:
         body, looks = furniture.cart(self.rng)
         line = walks.back_and_forth(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
         way, behind = walks.cart_path(self.rng, self.times, line, furniture.HANDLE - 0.5)
-        ways = [walk.transformed(0.0, distance + EYE_Y) for walk in (way, behind)]
+        ways = [walk.shifted(0.0, distance + EYE_Y) for walk in (way, behind)]
         return [
             *(Walker(person, ways[1], pushes=True) for person in pusher),
             MovableObject(body, looks, ways[0]),

@@ -193,7 +193,7 @@ def person_mesh(
         (1, -1), pose.shoulders, pose.elbows, pose.spread, strict=True
     ):
         parts += _arm(person, spine, side, (swing, bend, spread))
-    body = solids.join(parts)
+    body = solids.join_meshes(parts)
     return body.transformed(solids.yaw_rotation(heading), (position[0], position[1], -lowest))
 
 

@@ -15,7 +15,7 @@ from cohdc_train.synth.camera_motion import (
     CameraMotion,
     camera_path,
 )
-from cohdc_train.synth.mesh import join
+from cohdc_train.synth.mesh import join_meshes
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, RenderCamera, RenderedView, render
 from cohdc_train.synth.room import Room
@@ -95,13 +95,15 @@ class RenderedScene:
             [*self.room.textures, *(look for actor in self.actors for look in actor.textures)]
         )
 
-    def view(self, frame: int, atlas: Atlas) -> RenderedView:
+    def render_frame(self, frame: int, atlas: Atlas) -> RenderedView:
         """Render a frame as a perfect camera sees it; actors are instances 1.. in their order."""
         meshes, first = [self.room.mesh], len(self.room.textures)
         for k, actor in enumerate(self.actors):
-            meshes.append(actor.mesh(frame).named(k + 1, first))
+            meshes.append(actor.mesh(frame).as_instance(k + 1, first))
             first += len(actor.textures)
-        return render(join(meshes), atlas, self.room.lighting, self.camera, self.poses[frame])
+        return render(
+            join_meshes(meshes), atlas, self.room.lighting, self.camera, self.poses[frame]
+        )
 
 
 def draw_scene(

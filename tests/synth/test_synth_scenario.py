@@ -31,7 +31,7 @@ def scene_of(
 
 def views(scene: RenderedScene, step: int) -> list[RenderedView]:
     atlas = scene.atlas()
-    return [scene.view(k, atlas) for k in range(0, len(scene.poses), step)]
+    return [scene.render_frame(k, atlas) for k in range(0, len(scene.poses), step)]
 
 
 def people_in(scene: RenderedScene, view: RenderedView) -> float:
@@ -142,7 +142,7 @@ def test_seated_people_hardly_move_and_chairs_stay() -> None:
 def test_plain_walls_give_few_corners() -> None:
     def corners(walls: str) -> int:
         scene = draw_scene(7, 2, (240, 320), "static", 0, SceneConfig(walls=walls))  # type: ignore[arg-type]
-        view = scene.view(0, scene.atlas())
+        view = scene.render_frame(0, scene.atlas())
         upper = np.clip(view.rgb[:120] / view.rgb.mean() * 90, 0, 255).astype(np.uint8)
         return len(cv2.FastFeatureDetector_create(12).detect(upper))
 

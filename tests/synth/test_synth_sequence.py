@@ -108,7 +108,7 @@ def test_masks_are_binary_and_info_has_their_share(folder: Path) -> None:
 
 def test_masks_are_the_rendered_people(folder: Path) -> None:
     scene = draw_scene(4, FRAMES, SIZE, "xyz", 3)
-    view = scene.view(7, scene.atlas())
+    view = scene.render_frame(7, scene.atlas())
     masks = sorted((folder / "masks").iterdir())
     np.testing.assert_array_equal(cv2.imread(str(masks[7]), 0) == 255, view.instance > 0)
 
@@ -178,7 +178,9 @@ def test_wall_depth_follows_geometry_of_room() -> None:
 def test_people_cover_a_fifth_to_two_fifths(seed: int) -> None:
     scene = draw_scene(seed, 240, SIZE, "xyz", 3)
     coarse, atlas = replace(scene, camera=scene.camera.resized(0.5)), scene.atlas()
-    shares = np.array([(coarse.view(k, atlas).instance > 0).mean() for k in range(0, 240, 12)])
+    shares = np.array(
+        [(coarse.render_frame(k, atlas).instance > 0).mean() for k in range(0, 240, 12)]
+    )
     assert 0.2 < shares.mean() < 0.4
     assert shares.max() < 0.68
 

@@ -10,7 +10,7 @@ import yaml
 
 from cohdc_train.data.canvas import choose_canvas
 from cohdc_train.data.coco import CocoSplit, read_split
-from cohdc_train.data.doctor.anchor_recall import recall
+from cohdc_train.data.doctor.anchor_recall import anchor_recall
 from cohdc_train.data.doctor.sample_grid import draw_grid
 from cohdc_train.data.doctor.split_checks import SplitReport, check_split
 from cohdc_train.data.image_files import mirror_fingerprints
@@ -55,10 +55,10 @@ def doctor(
         print(
             f"{split.name}: {split.files.annotations}: {usable}, {len(split.removed)} rows cannot"
         )
-        print("\n".join(split.issues.lines()) or "  nothing found")
+        print("\n".join(split.issues.summary_lines()) or "  nothing found")
     if fix is not None:
         _write_fixed(splits, fix)
-    wrong = {split.name: split.issues.of("error") for split in splits}
+    wrong = {split.name: split.issues.of_severity("error") for split in splits}
     if out is not None:
         claim_folder(out, _VERB, ["issues.json", "annotations.jpg"])
         write_json(out / "issues.json", {split.name: split.issues.places for split in splits})
@@ -82,14 +82,14 @@ def stats(root: Path, classes: list[str] | None = None) -> None:
     """
     splits = [read_split(name, find_split(root, name), classes) for name in _SPLITS]
     for split in splits:
-        for name, value in count(split).items():
+        for name, value in count_objects(split).items():
             print(f"{split.name:<6}{name:<24}{value}")
     if set(splits[0].class_names) != set(splits[1].class_names):
         train, val = (split.class_names for split in splits)
         raise DataError(f"{root}: the classes of train and val differ: {train} {val}")
 
 
-def count(split: CocoSplit) -> dict[str, Any]:
+def count_objects(split: CocoSplit) -> dict[str, Any]:
     """Return the counts of one split, named as in Table 3 of the paper, and of each class."""
     objects = [o for image in split.images for o in image.objects]
     per_class = Counter(split.class_names[o.label - 1] for o in objects if not o.crowd)
@@ -108,7 +108,7 @@ def count(split: CocoSplit) -> dict[str, Any]:
 
 def summary(split: CocoSplit) -> str:
     """Return the counts of one split that are not zero, in one line."""
-    counts = {name: value for name, value in count(split).items() if name != "annotations"}
+    counts = {name: value for name, value in count_objects(split).items() if name != "annotations"}
     shown = [f"{name} {value}" for name, value in counts.items() if value]
     more = "; ..." if len(shown) > _SHOWN else ""
     return f"{split.name}: {'; '.join(shown[:_SHOWN])}{more}"
@@ -179,7 +179,7 @@ def _print_statistics(
     origin = "that cohdc fit chooses" if canvas == "auto" else "of --canvas"
     print(f"anchors {list(scales)} on the canvas {origin}, {height}x{width} px, objects of train:")
     boxes = _boxes(train, (height, width))
-    for row in recall(boxes, scales, (height, width)):
+    for row in anchor_recall(boxes, scales, (height, width)):
         shares = f"IoU >= .5: {row.at_50:6.1%}   >= .7: {row.at_70:6.1%}"
         print(f"  {row.size:<8}{row.objects:>7} objects   {shares}")
 

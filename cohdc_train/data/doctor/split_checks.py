@@ -155,7 +155,7 @@ def _image(split: SplitReport, row: Row, annotations: Sequence[Row]) -> Row | No
         if found:
             split.issues.add(kind, name)
     split.fingerprints[name] = _fingerprint(path)
-    sized = _sized(split, row, file, annotations)
+    sized = _with_file_size(split, row, file, annotations)
     if sized is not None and file.orientation > 1:
         is_turned = file.is_turned((sized["width"], sized["height"]))
         split.issues.add("image-turned" if is_turned else "image-exif", name)
@@ -169,7 +169,9 @@ def _fingerprint(path: Path) -> Float32Array:
         return np.zeros(256, dtype=np.float32)
 
 
-def _sized(split: SplitReport, row: Row, file: ImageFile, annotations: Sequence[Row]) -> Row | None:
+def _with_file_size(
+    split: SplitReport, row: Row, file: ImageFile, annotations: Sequence[Row]
+) -> Row | None:
     """Return the image row under a size at which the file is read; None when no size fits.
 
     A file is read upright, or as stored where that is the only size that fits.
@@ -218,7 +220,7 @@ def _annotations(
         for number, pairs in per_image.items()
         for row in _without_duplicates(split, images[number], pairs)
     ]
-    return _numbered(split, kept, images)
+    return _with_unique_ids(split, kept, images)
 
 
 def _without_duplicates(
@@ -239,7 +241,7 @@ def _without_duplicates(
     return [row for i, (row, _) in enumerate(pairs) if i not in duplicates]
 
 
-def _numbered(split: SplitReport, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
+def _with_unique_ids(split: SplitReport, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
     """Return the annotations with an id each."""
     used: set[int] = set()
     following = max((row["id"] for row in rows if isinstance(row.get("id"), int)), default=0) + 1

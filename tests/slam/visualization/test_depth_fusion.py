@@ -41,7 +41,7 @@ def errors_and_people(
     best, people = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.bool_)
     for frame in range(0, FRAMES, 4):
         room = render(scene.room.mesh, atlas, scene.room.lighting, camera, scene.poses[frame]).depth
-        full = scene.view(frame, atlas)
+        full = scene.render_frame(frame, atlas)
         local = (points - scene.poses[frame][:3, 3]) @ scene.poses[frame][:3, :3]
         ahead = np.flatnonzero(local[:, 2] > 0.1)
         x, y, z = local[ahead].T
