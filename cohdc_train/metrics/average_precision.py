@@ -7,8 +7,8 @@ import numpy as np
 from faster_coco_eval import COCO, COCOeval_faster
 from numpy.typing import NDArray
 
-from cohdc_train.metrics.detection_rows import Row
 from cohdc_train.metrics.rle import boundary_rle
+from cohdc_train.types import Row
 
 IOUS = np.linspace(0.5, 0.95, 10)  # COCO's thresholds
 RECALLS = np.linspace(0.0, 1.0, 101)  # COCO's recalls, at which it takes the precision

@@ -18,9 +18,10 @@ from cohdc_train.metrics.average_precision import (
     averages,
     precision_table,
 )
-from cohdc_train.metrics.detection_rows import Row, encode_detections
+from cohdc_train.metrics.detection_rows import encode_detections
 from cohdc_train.metrics.mask_overlap import calibration, match_masks, overlap_scores
 from cohdc_train.metrics.rle import boundary_rle
+from cohdc_train.types import Row
 
 
 @dataclass(frozen=True)

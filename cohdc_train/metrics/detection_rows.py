@@ -1,17 +1,15 @@
 """COCO result rows of an image's detections."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from cohdc_train.masks import roi_window
 from cohdc_train.metrics.rle import window_boundary, window_rle
+from cohdc_train.types import Row
 
 MAX_DETECTIONS = 100  # per image, as COCO counts them
-
-Row = dict[str, Any]
 
 
 def encode_detections(

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pycocotools import mask as rle
 from scipy.stats import spearmanr
 
-from cohdc_train.metrics.detection_rows import Row
 from cohdc_train.metrics.rle import to_rle
+from cohdc_train.types import Row
 
 MATCH_IOU = 0.5  # mask IoU from which a detection counts as having found an object
 MIN_SCORE = 0.5  # class score from which a detection counts for the quality's calibration

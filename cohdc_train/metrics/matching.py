@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.metrics.coco_metrics import Results
-from cohdc_train.metrics.detection_rows import Row
 from cohdc_train.metrics.mask_overlap import MATCH_IOU, MIN_SCORE, mask_ious, match_greedily
 from cohdc_train.metrics.rle import to_rle
+from cohdc_train.types import Row
 
 
 @dataclass(frozen=True)

@@ -7,35 +7,32 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from faster_coco_eval.core import mask as rle
-from numpy.typing import NDArray
 
 from cohdc_train.data.annotations import CocoImage
-from cohdc_train.data.doctor.sample_grid import read_fitted, tint, write_outlined
-from cohdc_train.metrics.detection_rows import Row
+from cohdc_train.data.doctor.sample_grid import read_fitted
+from cohdc_train.drawing import Color, draw_outline, encode_jpeg, fill_mask, write_text
 from cohdc_train.metrics.matching import ImageMatch
-
-Image = NDArray[np.uint8]
-Color = tuple[int, int, int]
+from cohdc_train.types import Image, Mask, Row
 
 _PANEL = (300, 400)  # px, height and width of truth and of prediction
 _LIST = 250  # px, width
 _LINE = 18  # px, height of a line of text
 _GAP = 6  # px
 _NUMBER = (20, 14)  # px, width and height
-_FILL = 0.35
-# BGR, of objects found as the right class; red and orange are kept for mistakes
+_OPACITY = 0.35
+# RGB, of objects found as the right class; red and orange are kept for mistakes
 _COLORS: tuple[Color, ...] = (
-    (75, 180, 60),
-    (230, 160, 30),
-    (240, 240, 70),
-    (200, 60, 160),
-    (90, 220, 220),
+    (60, 180, 75),
+    (30, 160, 230),
+    (70, 240, 240),
+    (160, 60, 200),
+    (220, 220, 90),
 )
-_MISTAKE: Color = (60, 60, 255)
-_WRONG_CLASS: Color = (0, 150, 255)
+_MISTAKE: Color = (255, 60, 60)
+_WRONG_CLASS: Color = (255, 150, 0)
 _CROWD: Color = (255, 255, 255)
 _INK: Color = (230, 230, 230)
-_PAPER = 28  # gray level of the background
+_PAPER = 28  # grey value of the background
 
 
 def draw_tiles(
@@ -74,8 +71,7 @@ def draw_tiles(
     head = _paper(3 * _LINE, columns * blank.shape[1])
     for line, text in enumerate((title, legend)):
         _write(head, text, (_GAP, (line + 1) * _LINE + 2), _INK, 0.5)
-    grid = np.vstack([head, *rows])
-    return bytes(cv2.imencode(".jpg", grid, [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
+    return encode_jpeg(np.vstack([head, *rows]))
 
 
 class _Entry(NamedTuple):
@@ -95,9 +91,9 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
     predicted = truth.copy()
     entries = _entries(match, names)
     for row in match.crowds:
-        tint(truth, _mask(row, truth), _CROWD, _FILL)
+        _tint(truth, _mask(row, truth), _CROWD)
     for missed in match.missed():
-        tint(truth, _mask(missed, truth), _MISTAKE, _FILL)
+        _tint(truth, _mask(missed, truth), _MISTAKE)
     _draw(truth, [(entry.object, entry.color) for entry in entries])
     _draw(predicted, [(entry.detection, entry.color) for entry in entries])
     right = int(match.is_correct.sum())
@@ -122,13 +118,19 @@ def _draw(shown: Image, rows: Sequence[tuple[Row | None, Color]]) -> None:
     masks = [None if row is None else _mask(row, shown) for row, _ in rows]
     for mask, (_, color) in zip(masks, rows, strict=True):
         if mask is not None:
-            tint(shown, mask, color, _FILL)
+            _tint(shown, mask, color)
     taken: list[tuple[int, int]] = []
     for number, mask in enumerate(masks, start=1):
         place = None if mask is None or not mask.any() else _free_place(mask, taken)
         if place is not None:
             taken.append(place)
-            write_outlined(shown, str(number), place, 0.5)
+            write_text(shown, str(number), place, 0.5)
+
+
+def _tint(shown: Image, mask: Mask, color: Color) -> None:
+    """Fill and outline a mask, in place."""
+    fill_mask(shown, mask, color, _OPACITY)
+    draw_outline(shown, mask, color)
 
 
 def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
@@ -175,20 +177,19 @@ def _list(match: ImageMatch, entries: Sequence[_Entry], names: Sequence[str]) ->
     return shown
 
 
-def _mask(row: Row, shown: Image) -> Image:
-    """Decode a row's mask, [H, W] of 0 and 1, at the size at which its image is shown."""
+def _mask(row: Row, shown: Image) -> Mask:
+    """Return a row's mask, [H, W] bool, at the size at which its image is shown."""
     decoded = rle.decode(row["segmentation"])
-    return np.asarray(
-        cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8
-    )
+    resized = cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized, np.bool_)
 
 
-def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
+def _free_place(mask: Mask, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
     """Return (x, y) of a number's lower left corner; None where there is no room.
 
     The place is where the mask is widest, or just below or above when a number stands there.
     """
-    depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     width, height = _NUMBER
     x = min(max(int(column) - width // 2, 0), max(mask.shape[1] - width, 0))

@@ -225,7 +225,7 @@ def test_fit_and_validate_write_their_figures(toy: Path, trained: Callable[..., 
                 str(run / "best.ckpt"),
                 str(toy),
                 "--workers=0",
-                f"--pictures={toy / 'new' / 'p'}",
+                f"--figures={toy / 'new' / 'p'}",
             ]
         )
         == 0
