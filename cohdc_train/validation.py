@@ -175,7 +175,7 @@ def score_module(
         trainer = Trainer(
             logger=False,
             enable_checkpointing=False,
-            precision=precision,  # type: ignore[arg-type]
+            precision=precision,
             enable_model_summary=False,
         )
         trainer.validate(module, datamodule=data, verbose=False)

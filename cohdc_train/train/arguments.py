@@ -1,15 +1,15 @@
 """Command line of `cohdc fit`: its options, data folders by position, shipped configs by name."""
 
 import json
+import sys
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser
 
-from cohdc_train.errors import CohdcError
 from cohdc_train.presets import config_path
 from cohdc_train.train.checkpoints import BEST_DEFAULTS
 
@@ -24,7 +24,10 @@ DESCRIPTION = (
 DEFAULT_NETWORK = "networks/hdc_net_n.yaml"
 _NETWORK_NAMES = ("backbone", "depth")  # fields that say which network is meant
 _CONFIG_OPTIONS = ("--config", "-c")
-_RENAMED = {"model.optimizer.frozen_steps": "model.optimizer.backbone_freeze_steps"}
+_RENAMED = {
+    "pictures": "figures",
+    "model.optimizer.frozen_steps": "model.optimizer.backbone_freeze_steps",
+}
 
 
 def add_fit_arguments(parser: LightningArgumentParser) -> None:
@@ -56,10 +59,10 @@ def add_fit_arguments(parser: LightningArgumentParser) -> None:
         help="decay of the weights' moving average, such as .999; 0: none",
     )
     parser.add_argument(
-        "--pictures",
+        "--figures",
         type=bool,
         default=True,
-        help="draw figures of each validation, in OUT/pictures",
+        help="draw figures of each validation, in OUT/figures",
     )
     parser.add_argument(
         "--lr_find",
@@ -88,7 +91,7 @@ def resolve_arguments(args: list[str]) -> list[str]:
     Where neither a config nor an option names a network, the default network comes first.
 
     Raises:
-        CohdcError: an option has been renamed; the message says to what.
+        SystemExit: an option has been renamed; the message on stderr says to what.
     """
     num_roots = next((i for i, arg in enumerate(args) if arg.startswith("-")), len(args))
     roots, options = args[:num_roots], args[num_roots:]
@@ -118,14 +121,20 @@ def names_network(args: list[str]) -> bool:
 
 
 def _check_renamed(args: list[str]) -> None:
-    """Raise CohdcError for an option, or a key of a config, that has another name now."""
+    """End the program where an option, or a key of a config, has another name now."""
     for old, new in _RENAMED.items():
         if any(arg.partition("=")[0] == f"--{old}" for arg in args):
-            raise CohdcError(f"--{old} is now --{new}")
+            _end(f"no option --{old}; it is --{new} now")
         section, _, key = old.rpartition(".")
         for path, content in _configs(args):
             if key in (_value_at(content, section) or {}):
-                raise CohdcError(f"{path}: {old} is now {new}")
+                _end(f"{path}: no option {old}; it is {new} now")
+
+
+def _end(message: str) -> NoReturn:
+    """End the program with the exit code of a wrong command line."""
+    print(f"cohdc fit: {message}", file=sys.stderr)
+    raise SystemExit(2)
 
 
 def _configs(args: list[str]) -> list[tuple[Path, dict[str, Any]]]:
@@ -139,6 +148,6 @@ def _configs(args: list[str]) -> list[tuple[Path, dict[str, Any]]]:
 def _value_at(content: dict[str, Any], section: str) -> Any:
     """Return the section of a config such as "model.network"; None where it is missing."""
     value: Any = content
-    for name in section.split("."):
+    for name in filter(None, section.split(".")):
         value = value.get(name) if isinstance(value, dict) else None
     return value

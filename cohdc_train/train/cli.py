@@ -58,8 +58,8 @@ def fit(args: list[str]) -> Trainer:
     """Train: `cohdc fit DATA [--config FILE.yaml] [--minutes N | --epochs N] [--out DIR]`.
 
     Writes below `--out`: `best.ckpt` (by val/segm_AP), `last.ckpt`, `config.yaml` (resolved),
-    `logs/version_N/` (CSV, TensorBoard), `pictures/` (figures of best.ckpt; `pictures/last/` of the
-    last validation; none with `--pictures false`).
+    `logs/version_N/` (CSV, TensorBoard), `figures/` (of best.ckpt; `figures/last/` of the last
+    validation; none with `--figures false`).
 
     Raises:
         CohdcError: in one line, for whatever the user can fix; a wrong key ends the program with
@@ -166,8 +166,8 @@ class FitCommand(LightningCLI):
     def _callbacks(self, config: Any) -> list[Callback]:
         """Return the callbacks of this command, then the user's own."""
         out = Path(self.config["out"])
-        figures = out / "pictures"
-        draws_figures = self.config["pictures"] and not config["fast_dev_run"]
+        figures = out / "figures"
+        draws_figures = self.config["figures"] and not config["fast_dev_run"]
         own = self.config_init["trainer"]["callbacks"] or []
         own = own if isinstance(own, list) else [own]
         shows_bar = self._shows_bar(config)

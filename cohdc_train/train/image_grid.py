@@ -32,7 +32,7 @@ _MISTAKE: Color = (255, 60, 60)
 _WRONG_CLASS: Color = (255, 150, 0)
 _CROWD: Color = (255, 255, 255)
 _INK: Color = (230, 230, 230)
-_PAPER = 28  # grey value of the background
+_PAPER = 28  # gray level of the background
 
 
 def draw_tiles(

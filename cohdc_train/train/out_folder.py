@@ -32,4 +32,4 @@ def claim_out(config: Mapping[str, Any]) -> None:
 def _names(config: Mapping[str, Any]) -> list[str]:
     """Return the names that a training replaces; logs/ gets a new version_N each time."""
     names = ["config.yaml", BEST, LAST, "lr_find.png"]
-    return [*names, "pictures"] if config["pictures"] else names
+    return [*names, "figures"] if config["figures"] else names

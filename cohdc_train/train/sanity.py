@@ -74,5 +74,5 @@ def overfit_verdict(scores: Mapping[str, float], num_images: int) -> str:
         return f"{trained}: labels and network agree"
     return (
         f"{trained}, {LEARNED_AP50} is normal: look at the labels (cohdc data doctor), at "
-        "pictures/worst.jpg, or train longer (--trainer.max_steps)"
+        "figures/worst.jpg, or train longer (--trainer.max_steps)"
     )

@@ -19,7 +19,7 @@ from cohdc_train.train.progress import ProgressReporter
 LOW_AP50 = 0.05
 MANY_SMALL = 0.3  # share of objects below the anchors from which the canvas is too small
 _SMALL_BATCH = 8  # images below which BatchNorm's statistics are noise
-_FILES = (BEST, LAST, "config.yaml", "pictures", "logs")
+_FILES = (BEST, LAST, "config.yaml", "figures", "logs")
 _PARTS = 5  # the first and the last fifth of the losses are compared
 _MIN_PART = 10  # steps of a fifth from which they are
 _CLEAR_FALL = 0.98  # of the loss in the first fifth
@@ -145,7 +145,7 @@ def _low_score_hint(facts: TrainingFacts) -> str:
             "start from trained ones (--pretrained auto)"
         )
     return (
-        f"{steps}: train longer (--minutes, --epochs), look at pictures/worst.jpg, and check the "
+        f"{steps}: train longer (--minutes, --epochs), look at figures/worst.jpg, and check the "
         "labels with cohdc data doctor and cohdc fit --overfit 8"
     )
 

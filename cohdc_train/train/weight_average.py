@@ -5,7 +5,7 @@ from torch import Tensor
 
 
 def weight_average(decay: float) -> WeightAveraging:
-    """Build Lightning's averaging callback, with a decay that grows towards `decay`.
+    """Build Lightning's averaging callback, with a decay that grows to `decay`.
 
     After n updates the decay is min(decay, (1 + n) / (10 + n)), so that the first steps are soon
     forgotten.

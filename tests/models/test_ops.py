@@ -16,7 +16,7 @@ def test_batched_suppression_equals_image_by_image(seed, images, count):
         [corner, corner + torch.rand(images, count, 2, generator=generator) * 200], dim=2
     )
     scores = torch.rand(images, count, generator=generator)
-    at_once = nms_keep_batched(boxes, scores, 0.5, 0.3)
-    assert torch.equal(at_once, nms_keep(boxes, scores, 0.5, 0.3))
-    assert not at_once[scores <= 0.3].any()
-    assert at_once.any(dim=1).equal((scores > 0.3).any(dim=1))
+    batched = nms_keep_batched(boxes, scores, 0.5, 0.3)
+    assert torch.equal(batched, nms_keep(boxes, scores, 0.5, 0.3))
+    assert not batched[scores <= 0.3].any()
+    assert batched.any(dim=1).equal((scores > 0.3).any(dim=1))

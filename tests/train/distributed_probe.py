@@ -55,7 +55,7 @@ def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
     found = []
     for image in images:
         boxes, labels = [], []
-        for label, color in enumerate(coco_toys.COLOURS.values()):
+        for label, color in enumerate(coco_toys.COLORS.values()):
             inside = (image == torch.tensor(color)[:, None, None]).all(dim=0)
             rows, columns = inside.any(dim=1).nonzero()[:, 0], inside.any(dim=0).nonzero()[:, 0]
             if len(rows):

@@ -27,7 +27,7 @@ model:
   network: {depth: 18, width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64],
             rois: 16, proposals: [50, 20]}
 trainer: {accelerator: cpu, max_epochs: 1, precision: 32-true}
-pictures: false
+figures: false
 """
 
 
@@ -327,11 +327,14 @@ def test_renamed_option_names_the_new_one(
     old, new = "model.optimizer.frozen_steps", "model.optimizer.backbone_freeze_steps"
     config = tmp_path / "old.yaml"
     config.write_text("model: {optimizer: {frozen_steps: 3}}")
-    assert main(["fit", *arguments(toy, toy / "bad", f"--{old}=3")]) == 1
-    assert main(["fit", *arguments(toy, toy / "bad", f"--config={config}")]) == 1
-    assert capsys.readouterr().err.splitlines() == [
-        f"cohdc fit: --{old} is now --{new}",
-        f"cohdc fit: {config}: {old} is now {new}",
+    for option in ("--pictures=false", f"--{old}=3", f"--config={config}"):
+        with pytest.raises(SystemExit) as stop:
+            fit(arguments(toy, toy / "bad", option))
+        assert stop.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-3:] == [
+        "cohdc fit: no option --pictures; it is --figures now",
+        f"cohdc fit: no option --{old}; it is --{new} now",
+        f"cohdc fit: {config}: no option {old}; it is {new} now",
     ]
 
 
@@ -362,7 +365,7 @@ def test_print_config_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> 
     assert shown["model"]["network"]["backbone"] == "mobilenet_v2"  # networks/hdc_net_n.yaml
     assert shown["pretrained"] == "auto"
     assert shown["checkpoint"]["monitor"] == "val/segm_AP"
-    assert shown["pictures"] is True
+    assert shown["figures"] is True
 
 
 def test_weight_average_is_validated_and_kept(toy: Path, run: Path, tmp_path: Path) -> None:

@@ -203,7 +203,7 @@ def trained(toy: Path) -> Callable[..., Path]:
                 str(toy / "tiny.yaml"),
                 f"--data.root={toy}",
                 f"--out={out}",
-                "--pictures=true",
+                "--figures=true",
                 *more,
             ]
         )
@@ -215,8 +215,8 @@ def trained(toy: Path) -> Callable[..., Path]:
 def test_fit_and_validate_write_their_figures(toy: Path, trained: Callable[..., Path]) -> None:
     run = trained("run")
     folders = {
-        run / "pictures": {*VALIDATION, "losses.png", "last"},
-        run / "pictures" / "last": VALIDATION,
+        run / "figures": {*VALIDATION, "losses.png", "last"},
+        run / "figures" / "last": VALIDATION,
     }
     assert (
         main(
@@ -240,10 +240,10 @@ def test_fit_and_validate_write_their_figures(toy: Path, trained: Callable[..., 
 @pytest.mark.parametrize(
     ("more", "drawn"),
     [
-        (["--pictures=true"], True),
-        (["--pictures=true", "--pictures=false"], False),
-        (["--pictures=true", "--config=off.yaml"], False),
-        (["--pictures=true", "--trainer.fast_dev_run=true"], False),
+        (["--figures=true"], True),
+        (["--figures=true", "--figures=false"], False),
+        (["--figures=true", "--config=off.yaml"], False),
+        (["--figures=true", "--trainer.fast_dev_run=true"], False),
     ],
 )
 def test_figures_are_drawn_unless_switched_off(
@@ -251,10 +251,10 @@ def test_figures_are_drawn_unless_switched_off(
 ) -> None:
     monkeypatch.chdir(toy)
     monkeypatch.setattr(FitCommand, "run", lambda self: None)
-    Path("off.yaml").write_text("pictures: false\n")
+    Path("off.yaml").write_text("figures: false\n")
     trainer = fit(["--config", "tiny.yaml", f"--data.root={toy}", f"--out={toy / 'off'}", *more])
     hooks = [hook for hook in trainer.callbacks if isinstance(hook, ValidationFigures)]  # type: ignore[attr-defined]
-    assert [hook.folder for hook in hooks] == [toy / "off" / "pictures"] * drawn
+    assert [hook.folder for hook in hooks] == [toy / "off" / "figures"] * drawn
 
 
 def test_figures_of_best_and_last_validation_are_kept(
@@ -270,7 +270,7 @@ def test_figures_of_best_and_last_validation_are_kept(
     # at this rate no epoch scores better than the first; Lightning's trial validation is not drawn
     folder = (
         trained("standstill", "--trainer.max_epochs=2", "--model.optimizer.lr=1e-12", *SHORT)
-        / "pictures"
+        / "figures"
     )
     assert [(folder / name).read_text() for name in ("figure.txt", "last/figure.txt")] == [
         "0",
