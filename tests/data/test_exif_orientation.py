@@ -21,9 +21,9 @@ from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoImage, find_split, read_split
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.data.doctor import sample_grid as grid
-from cohdc_train.exporter.sample_images import read_images
+from cohdc_train.exporter.sample_images import read_samples
 from cohdc_train.images import orientation_of, read_rgb
-from cohdc_train.prediction.image_sources import read_pictures
+from cohdc_train.prediction.image_sources import read_images
 
 Captured = pytest.CaptureFixture[str]
 HEIGHT, WIDTH = 96, 128
@@ -170,12 +170,12 @@ def test_every_reader_gives_the_same_upright_image(tmp_path: Path, suffix: str) 
     mask = np.asarray(draw())[..., 0] == COLOR[0]
     for path in sorted((tmp_path / "b").iterdir()):
         assert_labeled(read_image(CocoImage(1, path, HEIGHT, WIDTH, ())), mask)
-        (shown,) = read_pictures(path)
+        (shown,) = read_images(path)
         assert_labeled(shown.rgb, mask)
         fitted = grid.read_fitted(CocoImage(1, path, HEIGHT, WIDTH, ()), (HEIGHT, WIDTH))
         assert_labeled(fitted, mask)
     if suffix != "tif":
-        for pixels in read_images(tmp_path / "b", 8):
+        for pixels in read_samples(tmp_path / "b", 8):
             assert_labeled(pixels, mask)
 
 

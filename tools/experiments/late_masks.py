@@ -34,7 +34,7 @@ from cohdc_train.slam.runtime.executors import SynchronousExecutor
 from cohdc_train.slam.runtime.threads import one_thread
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 from cohdc_train.types import Mask
 
 
@@ -98,9 +98,9 @@ def error(source: Recorded, masks: Callable[[View], Mask], features: int, method
             tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
         tracker.finish()
     assert source.groundtruth is not None
-    rmse: float = score(read_tum(source.groundtruth), Trajectory(*tracker.trajectory()))["ate_m"][
-        "rmse"
-    ]
+    rmse: float = score(Trajectory.load_tum(source.groundtruth), Trajectory(*tracker.trajectory()))[
+        "ate_m"
+    ]["rmse"]
     return rmse
 
 

@@ -11,7 +11,7 @@ from ply_reader import read_ply
 
 from cohdc_train.slam.run import slam
 from cohdc_train.trajectory.association import match
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 pytest.importorskip("embreex", reason="the renderer comes with the train extra")
 
@@ -26,7 +26,9 @@ def in_the_world(run: Path, folder: Path) -> NDArray[np.float64]:
     """[n, 3] a run's cloud in the ground truth's world, m, by the first pose: a short way fixes no
     rotation.
     """
-    truth, estimate = match(read_tum(folder / "groundtruth.txt"), read_tum(run / "trajectory.txt"))
+    truth, estimate = match(
+        Trajectory.load_tum(folder / "groundtruth.txt"), Trajectory.load_tum(run / "trajectory.txt")
+    )
     T = truth.poses[0] @ np.linalg.inv(estimate.poses[0])
     return np.asarray(read_ply(run / "cloud.ply")[0] @ T[:3, :3].T + T[:3, 3])
 
