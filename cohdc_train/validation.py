@@ -51,11 +51,11 @@ class ValidationOptions:
 
 
 def validate(
-    model: Path,
-    data: Path,
+    model: Path | str,
+    data: Path | str,
     *,
-    out: Path | None = None,
-    figures: Path | None = None,
+    out: Path | str | None = None,
+    figures: Path | str | None = None,
     **options: Any,
 ) -> dict[str, float]:
     """Score a model on the validation split of a COCO-format folder, and print the scores.
@@ -77,9 +77,11 @@ def validate(
     """
     settings = ValidationOptions(**options)
     keep_freed_memory()
+    out = None if out is None else Path(out)
+    figures = None if figures is None else Path(figures)
     if figures is not None:
         check_folder(figures, "validate", VALIDATION_FILES, "--figures")
-    results, split = _score(model_path(model), data, settings)
+    results, split = _score(model_path(model), Path(data), settings)
     for name, value in results.scores.items():
         print(f"{name:<24}{value:.4f}")
     if out is not None:
