@@ -1,7 +1,7 @@
 """`cohdc validate`: scores of a checkpoint or an ONNX file on COCO-format data."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,9 @@ import torch
 from lightning.pytorch import Trainer
 
 from cohdc_train.data.annotations import read_image
-from cohdc_train.data.coco import CocoSplit
-from cohdc_train.data.datamodule import CocoDataModule
+from cohdc_train.data.coco import CocoSplit, read_split
+from cohdc_train.data.datamodule import CocoDataModule, check_images
+from cohdc_train.data.layout import find_split
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import check_folder, claim_folder, write_json
 from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
@@ -142,32 +143,18 @@ def common_split(root: Path, model: Path, class_names: Sequence[str]) -> CocoSpl
         class_names: classes of the ONNX file.
 
     Raises:
-        CohdcError: there is no such class, no object of them, or the folder cannot be used.
+        CohdcError: there is no such class.
+        DataError: an annotation or an image cannot be used.
     """
-    data = CocoDataModule(root)
-    split = data.folder.val
-    common = [name for name in split.class_names if name in class_names]
+    whole = read_split("val", find_split(root, "val"))
+    common = [name for name in whole.class_names if name in class_names]
     if not common:
-        known = ", ".join(split.class_names)
-        raise CohdcError(
-            f"{model}: none of its {len(class_names)} classes is one of {root}: {known}"
-        )
-    data.setup("validate")
-    return _select_classes(split, common)
-
-
-def _select_classes(split: CocoSplit, names: Sequence[str]) -> CocoSplit:
-    """Return a split without the objects of other classes; labels are renumbered from 1."""
-    if tuple(names) == split.class_names:
-        return split
-    labels = {split.class_names.index(name) + 1: new + 1 for new, name in enumerate(names)}
-    images = []
-    for image in split.images:
-        objects = [replace(o, label=labels[o.label]) for o in image.objects if o.label in labels]
-        images.append(replace(image, objects=tuple(objects)))
-    if not any(not o.crowd for image in images for o in image.objects):
-        raise CohdcError(f"{split.annotations}: no object of the classes {', '.join(names)}")
-    return replace(split, class_names=tuple(names), images=tuple(images))
+        known = ", ".join(whole.class_names)
+        count = len(class_names)
+        raise CohdcError(f"{model}: none of its {count} classes is one of {root}: {known}")
+    split = whole.with_classes(common)
+    check_images(split)
+    return split
 
 
 def score_module(

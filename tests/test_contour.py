@@ -1,4 +1,4 @@
-"""Outlines: exact tracing with parts and holes, the floor of IoU, the search that moves vertices."""
+"""Outlines: exact tracing with parts and holes, the floor of the IoU, the vertex search."""
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ FLOORS = st.sampled_from([0.8, 0.9, 0.95, 0.99, 1.0])
 
 
 def blob(seed: int, size: tuple[int, int] = SIZE) -> NDArray[np.bool_]:
-    """Smoothed noise above its 70th percentile: several parts with holes and bays."""
+    """Return smoothed noise above its 70th percentile: several parts with holes and bays."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=size), (0, 0), 6)
     return np.asarray(noise > np.quantile(noise, 0.7))
 
@@ -159,7 +159,7 @@ def test_fixed_tolerance_ignores_iou_floor() -> None:
 
 
 def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
-    """Every edge against every other, in plain Python: whether two cross in a point inside both."""
+    """Return whether two edges cross in a point inside both; compares all pairs."""
     edges = [
         (a, b)
         for ring in rings
@@ -181,7 +181,7 @@ def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
 def test_rings_do_not_cross_and_keep_orientation(
     seed: int, floor: float, method: ContourMethod
 ) -> None:
-    """Holes turn against their outer ring."""
+    """Holes have the opposite orientation of their outer ring."""
     simpler = simplify(trace(blob(seed)), floor, method, search=BeetleSearch(n=3))
     assert not cross_somewhere([ring for polygon in simpler for ring in polygon.rings])
 
@@ -207,7 +207,7 @@ def test_rings_cross_for_bow_tie_but_not_for_touching_squares() -> None:
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_iou_by_crossings_equals_iou_by_filling(seed: int) -> None:
-    """Of rings that cross themselves too."""
+    """It holds for rings that cross themselves, too."""
     mask = blob(seed)
     evaluator, rng = IoUEvaluator(polygons := trace(mask)), np.random.default_rng(seed)
     low, high = evaluator.low, evaluator.high
@@ -281,9 +281,7 @@ def test_odd_masks_have_outlines_that_keep_the_floor(name: str, method: ContourM
 
 
 def test_huge_mask_is_traced_and_simplified() -> None:
-    """8000 x 8000 px; with a full frame's area it would take minutes if a step were quadratic in
-    pixels.
-    """
+    """A step that is quadratic in pixels would take minutes for 8000 x 8000 px."""
     mask = np.zeros((8000, 8000), bool)
     cv2.ellipse(view := mask.view(np.uint8), (4000, 4000), (3500, 2000), 30, 0, 360, 1, -1)
     simpler = simplify(trace(mask), 0.97, "bas_dp")
@@ -314,7 +312,7 @@ def test_hole_must_have_opposite_orientation() -> None:
 @given(SEEDS, st.sampled_from([0.5, 0.8]))
 @settings(max_examples=60, deadline=None)
 def test_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
-    """Where a vertex's move may turn a ring over."""
+    """The move of a vertex may turn a small ring inside out."""
     mask = blob(seed)[20:36, 30:46]
     if mask.any():
         assert iou(rasterize(simplify(trace(mask), floor, "bas_dp"), mask.shape), mask) >= floor

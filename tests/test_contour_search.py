@@ -1,4 +1,4 @@
-"""Parts of the two searches: the bracket of tolerances, and the beetles."""
+"""Parts of the two searches: the bracket of tolerances, and the vertex swarm."""
 
 from math import exp, log
 
@@ -9,15 +9,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cohdc_train.contour import BeetleSearch, Polygon, count_vertices, rasterize, simplify, trace
-from cohdc_train.contour.beetle_search import _VertexSwarm
 from cohdc_train.contour.polygon_iou import IoUEvaluator, rings_cross
 from cohdc_train.contour.tolerance_search import ToleranceBracket
+from cohdc_train.contour.vertex_swarm import VertexSwarm
 
 SIZE = (96, 128)
 
 
 def two_discs(radius: float) -> NDArray[np.bool_]:
-    """One of 30 px, and one beside it."""
+    """Return a disc of 30 px and a second disc."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     big, small = (x - 40) ** 2 + (y - 48) ** 2 < 30**2, (x - 100) ** 2 + (y - 48) ** 2 < radius**2
     return np.asarray(big | small)
@@ -28,8 +28,9 @@ def two_discs(radius: float) -> NDArray[np.bool_]:
 def test_bracket_closes_on_the_tolerance_that_reaches_the_floor(
     right: float, power: float, wrong: float, allowed: float
 ) -> None:
-    """What is lost is a power of the tolerance; the first guess is off by `wrong`. Vertices never
-    end the search.
+    """The loss is a power of the tolerance, and the first guess is wrong by a factor.
+
+    The number of vertices never ends the search.
     """
     bracket = ToleranceBracket.of(0.25, 40.0, allowed, wrong * allowed / right)
     tried = 0
@@ -62,7 +63,7 @@ def test_vertices_that_move_together_are_no_neighbors(sizes: list[int], first: i
         angle = np.arange(size) * 2 * np.pi / size
         rings.append(np.stack([10 + 20 * k + 8 * np.cos(angle), 10 + 8 * np.sin(angle)], axis=1))
     polygons = [Polygon(ring) for ring in rings]
-    swarm = _VertexSwarm(polygons, IoUEvaluator(polygons), pairs=4)
+    swarm = VertexSwarm(polygons, IoUEvaluator(polygons), pairs=4)
     moved = set()
     for k in range(max(sizes)):
         for index in swarm._turns(first + k):
@@ -74,13 +75,11 @@ def test_vertices_that_move_together_are_no_neighbors(sizes: list[int], first: i
 @given(st.floats(4, 25), st.integers(0, 1000))
 @settings(max_examples=30, deadline=None)
 def test_sum_of_f_counts_differing_pixels(radius: float, seed: int) -> None:
-    """Through moves and drops, of one vertex, of several and of a whole part; counted by filling at
-    the end.
-    """
+    """It holds through moves and drops of one vertex, of several and of a whole part."""
     mask, rng = two_discs(radius), np.random.default_rng(seed)
     outline = trace(mask)
     evaluator = IoUEvaluator(outline)
-    swarm = _VertexSwarm(simplify(outline, 0.97), evaluator, pairs=4)
+    swarm = VertexSwarm(simplify(outline, 0.97), evaluator, pairs=4)
     for k, together in enumerate((3, 1, 2)):
         swarm.move(2.0, (2.0, 1.0)[k % 2], k, rng)
         choices = swarm.joint_removals(together) if together > 1 else swarm.cheapest_removals(1)
@@ -101,7 +100,7 @@ def test_small_part_is_dropped_and_large_part_stays() -> None:
 
 
 def test_moves_after_the_last_drop_raise_the_iou() -> None:
-    """Above what the floor asks for, with the vertices that are left."""
+    """The IoU rises above the floor with the same vertices."""
     mask = two_discs(25)
     polygons = trace(mask)
     spare = [

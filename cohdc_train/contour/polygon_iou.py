@@ -1,4 +1,4 @@
-"""How well polygons cover an outline, told by where edges cross the columns of pixels."""
+"""IoU of polygons with an outline, from where their edges cross the columns of pixels."""
 
 from collections.abc import Sequence
 from functools import cache, cached_property
@@ -10,20 +10,25 @@ from numpy.typing import NDArray
 from cohdc_train.contour.polygons import CENTER, Polygon, crossings, edges
 from cohdc_train.types import FloatArray, Int32Array, IntArray, Mask
 
-_PER_PX = 5  # places for a vertex along a px: one decimal in a file, and the grid that COCO's tools fill on
+_PER_PX = 5  # places of a vertex per px: the grid that COCO's tools fill on
 
 
 class IoUEvaluator:
-    """The outline that simpler ones are compared with, on the grid of its bounds.
+    """Compares simpler polygons with an outline, on the grid of the outline's bounds.
 
     Nothing is filled. A crossing with a column's center line has a place, which counts rows down
     the columns one after another. Between the first place and the second, the third and the fourth
-    and so on in their order lie the pixels
-    inside: the even-odd rule. Places of two outlines together enclose the pixels that only one of
-    them has.
+    and so on, in their order, lie the pixels inside: the even-odd rule. Places of two outlines
+    together enclose the pixels that only one of them has.
+
+    Attributes:
+        low: [2] px, upper left of the bounds.
+        high: [2] px, lower right of the bounds.
+        area: pixels of the outline.
     """
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
+        """Take the polygons of an outline, as `trace` gives them."""
         rings = [ring for polygon in polygons for ring in polygon.rings]
         start, end = edges(rings)
         axes = np.ascontiguousarray(start.T)
@@ -31,29 +36,26 @@ class IoUEvaluator:
         self._first_center = self.low + CENTER
         self._width, height = (self.high - self.low).astype(int).tolist()
         self._rows = height + 1  # places in a column
-        across = np.flatnonzero(
-            start[:, 0] != end[:, 0]
-        )  # of a traced outline half the edges run along columns
-        self._places = np.sort(
-            self._crossed(start.take(across, axis=0), end.take(across, axis=0))[0]
-        )
+        # half the edges of a traced outline run along columns
+        across = np.flatnonzero(start[:, 0] != end[:, 0])
+        places, _, _ = self._crossed(start.take(across, axis=0), end.take(across, axis=0))
+        self._places = np.sort(places)
         self.area = _enclosed(self._places)
         self._sign = _orientation(polygons[0].outer)
 
     def iou(self, polygons: Sequence[Polygon]) -> float:
-        """IoU, 0..1, of polygons that lie within the bounds, as they are filled by the even-odd
-        rule.
-        """
+        """Return the IoU, 0..1, with polygons within the bounds, filled by the even-odd rule."""
         rings = [ring for polygon in polygons for ring in polygon.rings]
         return self.iou_of_edges(*edges(rings)) if rings else 0.0
 
     def iou_of_edges(self, start: FloatArray, end: FloatArray) -> float:
-        """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
+        """Return the IoU, 0..1, with closed rings, given as edges [E, 2] -> [E, 2]."""
         return self.approximate_iou(*self.count_pixels(start, end))
 
     def count_pixels(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
-        """Pixels that closed rings cover, and that only they or the outline have; edges [E, 2] ->
-        [E, 2].
+        """Count the pixels that closed rings cover, and those that only they or the outline have.
+
+        The rings are given as edges [E, 2] -> [E, 2].
         """
         places = self._crossed(start, end)[0]
         both = np.concatenate((self._places, places))
@@ -62,14 +64,14 @@ class IoUEvaluator:
         return _enclosed(places), _enclosed(both)
 
     def approximate_iou(self, covered: float, apart: int) -> float:
-        """IoU of what covers so many pixels, so many of which only one of it and the outline has."""
+        """Return the IoU with polygons that cover so many pixels, of which `apart` differ."""
         return (self.area + covered - apart) / (self.area + covered + apart)
 
     def count_added_pixels(self, start: FloatArray, end: FloatArray) -> IntArray:
-        """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
+        """Count what edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
 
-        Less a constant per column, which is the same for all ways from one point to another; of
-        rings that do not cross themselves and turn as they were traced.
+        A constant per column is missing, which is the same for all paths from one point to another.
+        It holds for rings that do not cross themselves and keep the orientation of the traced ones.
         """
         places, first, run = self._crossed(start, end)
         alone = np.zeros(len(places) + 1, np.int32)
@@ -79,7 +81,7 @@ class IoUEvaluator:
 
     @cached_property
     def _alone(self) -> Int32Array:
-        """Rows above every place less twice the outline's pixels above it."""
+        """Rows above every place, less twice the outline's pixels above it."""
         hits = np.zeros(self._width * self._rows, np.uint8)
         np.add.at(hits, self._places.astype(np.int64), 1)
         inside = np.bitwise_xor.accumulate(hits) & 1
@@ -90,19 +92,16 @@ class IoUEvaluator:
         return signed
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
-        """Places where edges cross the columns, the first of every edge, and the columns it runs
-        along.
-        """
+        """Return the places where edges cross columns, the first of every edge, and its columns."""
         places, row, first, run = crossings(start, end, self._first_center)
         places *= self._rows
         places += row
         return places, first, run
 
     def snap_to_grid(self, points: FloatArray) -> FloatArray:
-        """Points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
-        placed: FloatArray = (
-            points * _PER_PX
-        )  # exact for what is traced, so that halves go the same way everywhere
+        """Return points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
+        # exact for traced points, so that halves are rounded the same way everywhere
+        placed: FloatArray = points * _PER_PX
         placed += 0.5
         np.floor(placed, out=placed)
         placed /= _PER_PX
@@ -112,8 +111,9 @@ class IoUEvaluator:
         return placed
 
     def is_valid(self, polygons: Sequence[Polygon]) -> bool:
-        """Whether no ring crosses another or itself, and all turn as the outline's do: holes
-        against outer rings.
+        """Return whether no rings cross, and all have the orientation of the outline's rings.
+
+        Holes have the opposite one.
         """
         for polygon in polygons:
             if _orientation(polygon.outer) != self._sign or any(
@@ -124,18 +124,18 @@ class IoUEvaluator:
 
 
 def _enclosed(places: FloatArray) -> int:
-    """Pixels between places in order."""
+    """Count the pixels between places in order."""
     return int(_signs(len(places).bit_length())[: len(places)] @ places)
 
 
 @cache
 def _signs(bits: int) -> FloatArray:
-    """-1, 1, -1, 1 and so on, 2^bits of them."""
+    """Return -1, 1, -1, 1 and so on, 2^bits of them."""
     return np.tile([-1.0, 1.0], 2**bits // 2)
 
 
 def _orientation(ring: FloatArray) -> int:
-    """-1 where a ring [n, 2] goes clockwise as seen in an image, else 1."""
+    """Return -1 where a ring [n, 2] goes clockwise as seen in an image, else 1."""
     return 1 if cv2.contourArea(ring.astype(np.float32), oriented=True) < 0 else -1
 
 
@@ -143,7 +143,7 @@ _BLOCK = 1024  # edges compared at a time
 
 
 def rings_cross(rings: Sequence[FloatArray]) -> bool:
-    """Whether two edges cross, of one ring or of two; rings that only touch do not.
+    """Return whether two edges cross, of one ring or of two; rings that only touch do not.
 
     Exact for points with one decimal.
     """
@@ -162,8 +162,9 @@ def rings_cross(rings: Sequence[FloatArray]) -> bool:
 
 
 def _separates(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> Mask:
-    """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different
-    sides: [m, n].
+    """Return [m, n]: the lines through edges [2, m] separate the ends of other edges [2, n].
+
+    Points are complex: x + iy.
     """
     start, along = edges[0, :, None], edges[1, :, None] - edges[0, :, None]
     sides = ((others[:, None] - start) * along.conj()).imag

@@ -1,4 +1,4 @@
-"""A mask's exact outline with its parts and holes, and back."""
+"""Trace the exact outline of a mask with its parts and holes, and fill it again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +9,17 @@ import numpy as np
 
 from cohdc_train.types import FloatArray, IntArray, Mask
 
-CENTER = np.array(
-    [0.5, 0.5 + 1e-7]
-)  # px; an edge that near a pixel's center goes through it, wherever the grid begins
+# px; an edge this near to a pixel's center goes through it, wherever the grid begins
+CENTER = np.array([0.5, 0.5 + 1e-7])
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """One connected part of a mask. outer: [n, 2] px, n >= 3; holes: rings of the same kind inside
-    it.
+    """One connected part of a mask.
+
+    Attributes:
+        outer: [n, 2] px, n >= 3.
+        holes: rings of the same kind inside it.
     """
 
     outer: FloatArray
@@ -25,19 +27,21 @@ class Polygon:
 
     @property
     def rings(self) -> tuple[FloatArray, ...]:
-        """The outer ring, then the holes."""
+        """Outer ring, then the holes."""
         return (self.outer, *self.holes)
 
     def keyhole(self) -> FloatArray:
-        """The part as one ring [n, 2], px: every hole is joined by a bridge of no width, for
-        formats without holes.
+        """Return the part as one ring [n, 2], px, for formats without holes.
+
+        Every hole is joined by a bridge of no width.
         """
         return _bridge(self.rings)
 
 
 def join_polygons(polygons: Sequence[Polygon]) -> FloatArray:
-    """All parts as one ring [n, 2], px, joined by bridges of no width, for formats of one ring per
-    object.
+    """Return all parts as one ring [n, 2], px, for formats of one ring per object.
+
+    Parts are joined by bridges of no width.
     """
     return _bridge([polygon.keyhole() for polygon in polygons])
 
@@ -52,22 +56,23 @@ def _bridge(rings: Sequence[FloatArray]) -> FloatArray:
 
 
 def trace(mask: Mask) -> list[Polygon]:
-    """The outline of a mask [H, W] along the edges of its pixels, one polygon per 8-connected part.
+    """Trace the outline of a mask along the edges of its pixels, one polygon per 8-connected part.
 
-    Filling the polygons gives exactly the mask back (inner corners are cut by half a pixel, which
-    reaches no pixel's center); an empty mask has none.
+    Filling the polygons gives exactly the mask again (inner corners are cut by half a pixel, which
+    reaches no pixel's center). An empty mask has none.
+
+    mask: [H, W] bool.
     """
-    # a grid of the pixels' corners and centers: every pixel sets its 3 x 3 nodes, so the border
-    # runs along pixel edges
+    # Nodes are the pixels' corners and centers. A pixel sets its 3 x 3 nodes, so that the border
+    # runs along pixel edges.
     nodes = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
     nodes[1::2, 1::2] = mask
     nodes = cv2.dilate(nodes, np.ones((3, 3), np.uint8))
     found, hierarchy = cv2.findContours(nodes, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     rings = [ring.reshape(-1, 2).astype(np.float64) / 2 for ring in found]
     parents = [] if hierarchy is None else hierarchy.reshape(-1, 4)[:, 3].tolist()
-    parts: dict[int, list[FloatArray]] = {
-        k: [ring] for k, ring in enumerate(rings) if parents[k] < 0
-    }
+    outer_rings = {k: ring for k, ring in enumerate(rings) if parents[k] < 0}
+    parts = {k: [ring] for k, ring in outer_rings.items()}
     for ring, parent in zip(rings, parents, strict=True):
         if parent >= 0:
             parts[parent].append(ring)
@@ -101,8 +106,14 @@ def pixel_borders(mask: Mask) -> list[list[float]] | None:
 
 
 def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> Mask:
-    """Fill polygons by the even-odd rule at pixel centers. size: (height, width), px. Returns
-    [height, width] bool.
+    """Fill polygons by the even-odd rule at pixel centers.
+
+    Args:
+        polygons: in px.
+        size: (height, width), px.
+
+    Returns:
+        [height, width] bool.
     """
     if not polygons:
         return np.zeros(size, np.bool_)
@@ -118,7 +129,7 @@ def rasterize(polygons: Sequence[Polygon], size: tuple[int, int]) -> Mask:
 
 
 def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Where the edges of all rings begin and end: two [E, 2], px. There is a ring at least."""
+    """Return the beginnings and ends of the edges of all rings, [E, 2] each, px; needs a ring."""
     if len(rings) == 1:
         (ring,) = rings
         return ring, np.concatenate((ring[1:], ring[:1]))
@@ -128,11 +139,13 @@ def edges(rings: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
 
 
 class Crossings(NamedTuple):
-    """Where E edges cross the center lines of a grid's columns, N times, edge after edge.
+    """N crossings of E edges with the center lines of a grid's columns, edge after edge.
 
-    column, row: [N] whole numbers; the row is that of the first pixel center below.
-    first: [E], the first crossing of every edge; run: [E], columns from its start to its end, with
-    their sign.
+    Attributes:
+        column: [N] whole numbers.
+        row: [N] whole numbers, of the first pixel center below.
+        first: [E], the first crossing of every edge.
+        run: [E], columns from its beginning to its end, signed.
     """
 
     column: FloatArray
@@ -144,10 +157,13 @@ class Crossings(NamedTuple):
 def crossings(
     start: FloatArray, end: FloatArray, origin: FloatArray, width: int | None = None
 ) -> Crossings:
-    """Crossings of edges [E, 2] -> [E, 2], px, with columns.
+    """Return the crossings of edges [E, 2] -> [E, 2], px, with columns.
 
-    origin: [2] px, the CENTER of the grid's first pixel. width: that the columns are limited to;
-    without it no point may lie beside the grid.
+    Args:
+        start: [E, 2] px.
+        end: [E, 2] px.
+        origin: [2] px, the CENTER of the grid's first pixel.
+        width: number of columns; without it no point may lie outside the grid.
     """
     x, to_x = start[:, 0] - origin[0], end[:, 0] - origin[0]
     y = start[:, 1] - origin[1]
@@ -169,5 +185,5 @@ def crossings(
 
 
 def count_vertices(polygons: Sequence[Polygon]) -> int:
-    """How many vertices polygons have together."""
+    """Count the vertices of all polygons."""
     return sum(len(ring) for polygon in polygons for ring in polygon.rings)

@@ -60,12 +60,37 @@ class CocoSplit:
             raise DataError(
                 f"{self.annotations}: classes are {ours}; the training split's are {theirs}"
             )
-        to = [class_names.index(name) + 1 for name in self.class_names]
-        images = tuple(
-            replace(image, objects=tuple(replace(o, label=to[o.label - 1]) for o in image.objects))
-            for image in self.images
-        )
-        return replace(self, class_names=tuple(class_names), images=images)
+        labels = {
+            label: class_names.index(name) + 1 for label, name in enumerate(self.class_names, 1)
+        }
+        return self._relabeled(class_names, labels)
+
+    def with_classes(self, class_names: Sequence[str]) -> "CocoSplit":
+        """Return the split with the objects of some of its classes only.
+
+        Raises:
+            DataError: no object is left.
+        """
+        kept = [name for name in self.class_names if name in class_names]
+        labels = {self.class_names.index(name) + 1: kept.index(name) + 1 for name in kept}
+        split = self._relabeled(kept, labels)
+        split.check_objects()
+        return split
+
+    def _relabeled(self, class_names: Sequence[str], labels: dict[int, int]) -> "CocoSplit":
+        """Return the split with new labels, without objects whose label has no new one."""
+        images = []
+        for image in self.images:
+            kept = [o for o in image.objects if o.label in labels]
+            objects = tuple(replace(o, label=labels[o.label]) for o in kept)
+            images.append(replace(image, objects=objects))
+        return replace(self, class_names=tuple(class_names), images=tuple(images))
+
+    def check_objects(self) -> None:
+        """Raise DataError when there is no object to learn or to score."""
+        if not self.without_empty_images().images:
+            why = dict(self.dropped) or "no annotation of these classes"
+            raise DataError(f"{self.annotations}: no object to learn: {why}")
 
     def subset(self, count: int | None) -> "CocoSplit":
         """Return the split with `count` images, drawn at random but always the same; None for all.
@@ -189,7 +214,8 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
     """
     content = read_json(files.annotations)
     names, labels = _class_map(files.annotations, content["categories"], classes)
-    images = {image.id: image for image in (_read_image(files, row) for row in content["images"])}
+    listed = [_read_image(files, row) for row in content["images"]]
+    images = {image.id: image for image in listed}
     if len(images) != len(content["images"]):
         raise DataError(
             f"{files.annotations}: {len(content['images']) - len(images)} image ids are used twice"
@@ -210,10 +236,9 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         clipped += exceeds_image(row.get("bbox"), image)
         objects[image.id].append(build_object(row, label, segmentation, image))
     kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
-    if not any(o for image in kept for o in image.objects if not o.crowd):
-        why = dict(dropped) or "no annotation of these classes"
-        raise DataError(f"{files.annotations}: no object to learn: {why}")
-    return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
+    split = CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
+    split.check_objects()
+    return split
 
 
 def _class_map(

@@ -60,36 +60,40 @@ def convert(
         DataError: a file cannot be used; one line names the file and the row.
     """
     with new_folder(out) as draft:
-        found = _read(format, source, attribute, names)
-        splits = _assign_splits(source, found, val, seed)
-        classes = found.class_names or sorted(
-            {o.name for images in splits.values() for i in images for o in i.objects}
-        )
-        file_names = _write_images(splits.values(), draft / "images", found)
+        dataset = _read_source(format, source, attribute, names)
+        splits = _assign_splits(source, dataset, val, seed)
+        classes = dataset.class_names or _class_names(splits)
+        file_names = _write_images(splits.values(), draft / "images", dataset)
         for name, images in splits.items():
-            content = _coco_content(images, file_names, classes, found)
+            content = _coco_content(images, file_names, classes, dataset)
             if not content["annotations"]:
-                reasons = [f"{len(where)} skipped: {why}" for why, where in found.skipped.items()]
+                reasons = [f"{len(where)} skipped: {why}" for why, where in dataset.skipped.items()]
                 problem = f"no object in {name} of {len(images)} images"
                 raise DataError(f"{source}: {'; '.join([problem, *reasons])}")
             write_text(draft / f"instances_{name}.json", json.dumps(content))
         written = [_read_back(draft, name, out) for name in splits]
-    print(f"split: {_describe_split(found, val, seed)}")
+    print(f"split: {_describe_split(dataset, val, seed)}")
     print("\n".join(summary(split) for split in written))
-    _print_counts("skipped", found.skipped)
-    _print_counts("worth knowing", found.notes)
+    _print_counts("skipped", dataset.skipped)
+    _print_counts("worth knowing", dataset.notes)
     print(f"next: cohdc data doctor {out}")
 
 
-def _describe_split(found: SourceDataset, val: float, seed: int) -> str:
+def _class_names(splits: Mapping[str, Sequence[SourceImage]]) -> list[str]:
+    """Return the names of all classes that have an object, sorted."""
+    images = [image for part in splits.values() for image in part]
+    return sorted({o.name for image in images for o in image.objects})
+
+
+def _describe_split(dataset: SourceDataset, val: float, seed: int) -> str:
     """Return where the split comes from."""
-    if "" not in found.splits:
+    if "" not in dataset.splits:
         return "the source's own"
-    origin = f" from {found.drawn_from}" if found.drawn_from else ""
+    origin = f" from {dataset.drawn_from}" if dataset.drawn_from else ""
     return f"drawn{origin}, --val {val} --seed {seed}"
 
 
-def _read(
+def _read_source(
     format: AnnotationFormat, source: Path, attribute: str | None, names: Path | None
 ) -> SourceDataset:
     if attribute is not None and format != "via":
@@ -104,18 +108,18 @@ def _read(
 
 
 def _assign_splits(
-    source: Path, found: SourceDataset, val: float, seed: int
+    source: Path, dataset: SourceDataset, val: float, seed: int
 ) -> dict[str, list[SourceImage]]:
     """Return the source's own split, or draw one: a share `val` of the images, at least one."""
-    for images in found.splits.values():
+    for images in dataset.splits.values():
         path, count = (
             Counter(image.path for image in images).most_common(1)[0] if images else (source, 1)
         )
         if count > 1:
             raise DataError(f"{path}: annotated {count} times")
-    if "" not in found.splits:
-        return found.splits
-    images = sorted(found.splits[""], key=lambda image: image.path)
+    if "" not in dataset.splits:
+        return dataset.splits
+    images = sorted(dataset.splits[""], key=lambda image: image.path)
     if not 0 < val < 1:
         raise DataError(f"--val {val}: must be between 0 and 1")
     if len(images) < 2:
@@ -129,7 +133,7 @@ def _assign_splits(
 
 
 def _write_images(
-    splits: Iterable[Sequence[SourceImage]], folder: Path, found: SourceDataset
+    splits: Iterable[Sequence[SourceImage]], folder: Path, dataset: SourceDataset
 ) -> dict[Path, str]:
     """Write every image once, and return its file name by its path in the source.
 
@@ -142,7 +146,7 @@ def _write_images(
     for path, image in images.items():
         _write_image(image, folder / names[path])
         if image.apply_exif:
-            found.note(_TURNED, str(path))
+            dataset.note(_TURNED, str(path))
     return names
 
 
@@ -162,7 +166,7 @@ def _coco_content(
     images: Sequence[SourceImage],
     file_names: Mapping[Path, str],
     classes: Sequence[str],
-    found: SourceDataset,
+    dataset: SourceDataset,
 ) -> dict[str, Any]:
     """Return the COCO dict of a split.
 
@@ -178,7 +182,7 @@ def _coco_content(
             seen = check_annotation({"segmentation": o.segmentation}, image.height, image.width)
             kinds = [ISSUE_KINDS[kind].description for kind in seen.issues if kind != "box-missing"]
             if seen.row is None:
-                found.skip(kinds.pop(), o.where)
+                dataset.skip(kinds.pop(), o.where)
             else:
                 owner = {
                     "id": len(annotations) + 1,
@@ -188,7 +192,7 @@ def _coco_content(
                 }
                 annotations.append(owner | seen.row)
             for kind in kinds:
-                found.note(kind, o.where)
+                dataset.note(kind, o.where)
     categories = [{"id": i, "name": name} for name, i in ids.items()]
     return {"images": rows, "annotations": annotations, "categories": categories}
 

@@ -193,10 +193,7 @@ class CocoDataModule(pl.LightningDataModule):
         """
         splits = [self.folder.val, *(self.paste_sources if stage == "fit" else ())]
         for split in splits:
-            if split.reading_report():
-                rank_zero_info(split.reading_report())
-            for image in split.images:
-                image_files.check_image(image.path, image.id, (image.width, image.height))
+            check_images(split)
 
     @cached_property
     def val_ground_truth(self) -> dict[str, Any]:
@@ -243,6 +240,18 @@ class CocoDataModule(pl.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.workers > 0,
         )
+
+
+def check_images(split: CocoSplit) -> None:
+    """Check every image file of a split, and print what reading its annotations skipped.
+
+    Raises:
+        DataError: an image is missing, damaged or not of its annotated size; one line names it.
+    """
+    if split.reading_report():
+        rank_zero_info(split.reading_report())
+    for image in split.images:
+        image_files.check_image(image.path, image.id, (image.width, image.height))
 
 
 def _images(splits: Sequence[CocoSplit]) -> list[CocoImage]:

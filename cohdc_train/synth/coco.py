@@ -13,7 +13,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder
 from cohdc_train.synth import people as bodies
 from cohdc_train.synth.coco_annotation import annotate
-from cohdc_train.synth.mesh import join
+from cohdc_train.synth.mesh import join_meshes
 from cohdc_train.synth.option_checks import check_size_and_seed
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, RenderCamera, render
@@ -92,9 +92,13 @@ def render_image(
         body = bodies.person_mesh(
             person, bodies.draw_pose(rng), place, float(rng.uniform(0, 2 * np.pi))
         )
-        meshes.append(body.named(k + 1, len(room.textures) + 6 * k))
+        meshes.append(body.as_instance(k + 1, len(room.textures) + 6 * k))
     view = render(
-        join(meshes), room_with_people.atlas, _vary_lighting(room.lighting, rng), camera, T_wc
+        join_meshes(meshes),
+        room_with_people.atlas,
+        _vary_lighting(room.lighting, rng),
+        camera,
+        T_wc,
     )
     return LabeledImage(_expose(view.rgb, rng, size), _visible_masks(view.instance, size))
 

@@ -9,7 +9,7 @@ from cohdc_train.types import Mask
 
 
 def run_lengths(mask: Mask) -> dict[str, list[int]]:
-    """Return COCO's uncompressed RLE of a mask [H, W]: runs of 0, 1, 0, ... by column."""
+    """Return COCO's uncompressed RLE of a mask [H, W]: runs of 0, 1, ... by column."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(np.diff(flat)) + 1
     edges = np.concatenate([[0] if not flat[0] else [0, 0], changes, [flat.size]])
@@ -17,7 +17,9 @@ def run_lengths(mask: Mask) -> dict[str, list[int]]:
 
 
 def annotate(mask: Mask, image_id: int, annotation_id: int, crowd: bool = False) -> dict[str, Any]:
-    """Return the COCO annotation of one visible person: polygons, or run lengths where it has holes.
+    """Return the COCO annotation of one visible person.
+
+    It has polygons, or run lengths where a part has a hole.
 
     Args:
         mask: [H, W] bool, not empty.

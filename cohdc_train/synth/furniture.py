@@ -29,7 +29,7 @@ def chair(seat: float) -> Mesh:
     for y in (-0.2, 0.2):
         parts.append(solids.box((0.31, y, seat / 2 - 0.02), (0.035, 0.035, seat - 0.04), 0, 0, 0))
         parts.append(solids.box((-0.17, y, seat / 2 + 0.14), (0.035, 0.035, seat + 0.28), 0, 0, 0))
-    return solids.join(parts)
+    return solids.join_meshes(parts)
 
 
 def chair_texture(rng: np.random.Generator) -> Texture:
@@ -67,7 +67,7 @@ def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
             (-0.2, 0.05, 0.225 + low + 0.11), (0.3, 0.34, 0.22), float(rng.normal(0, 0.1)), 3, 1
         )
     )
-    return solids.join(parts), looks
+    return solids.join_meshes(parts), looks
 
 
 def _metal(rng: np.random.Generator) -> Texture:

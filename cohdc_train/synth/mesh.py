@@ -37,7 +37,7 @@ class Mesh:
             self, corners=corners, normals=(self.normals.reshape(-1, 3) @ turn).reshape(-1, 3, 3)
         )
 
-    def named(self, instance: int, first_texture: int) -> "Mesh":
+    def as_instance(self, instance: int, first_texture: int) -> "Mesh":
         """Return the mesh with another instance number, and textures from `first_texture` on."""
         return replace(
             self,
@@ -46,7 +46,7 @@ class Mesh:
         )
 
 
-def join(meshes: Sequence[Mesh]) -> Mesh:
+def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
     """Return all triangles of several meshes, in order, with their texture and instance numbers."""
     return Mesh(
         np.concatenate([m.corners for m in meshes]),
@@ -158,7 +158,7 @@ def box(center: ArrayLike, size: ArrayLike, yaw: float, side: int, top: int) -> 
         quad((-x, y, z), (2 * x, 0, 0), (0, -2 * y, 0), top),
         quad((-x, -y, -z), (2 * x, 0, 0), (0, 2 * y, 0), top),
     ]
-    return join(faces).transformed(yaw_rotation(yaw), center)
+    return join_meshes(faces).transformed(yaw_rotation(yaw), center)
 
 
 def tube(

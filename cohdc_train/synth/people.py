@@ -56,7 +56,10 @@ class BodyPose:
 
 
 def draw_person(rng: np.random.Generator, patterned: float = 0.6) -> Person:
-    """Draw an adult or teenager with clothes. patterned: probability of a pattern."""
+    """Draw an adult or teenager with clothes.
+
+    patterned: probability of a shirt with a pattern.
+    """
     tone, hair = clothes.skin_tone(rng), clothes.hair_color(rng)
     looks = (
         clothes.cloth(rng, patterned),
@@ -83,7 +86,10 @@ def stride(person: Person) -> float:
 
 
 def walking(phase: float, vigor: float = 1.0) -> BodyPose:
-    """Return the pose at `phase` rad of the walk cycle (2 pi = two steps); vigor 0 stands, 1 walks."""
+    """Return the pose at `phase` rad of the walk cycle, of which 2 pi are two steps.
+
+    vigor: 0 stands, 1 walks.
+    """
     s, c = np.sin(phase), np.cos(phase)
     swing = 0.46 * vigor
     lift = 0.85 * vigor
@@ -187,7 +193,7 @@ def person_mesh(
         (1, -1), pose.shoulders, pose.elbows, pose.spread, strict=True
     ):
         parts += _arm(person, spine, side, (swing, bend, spread))
-    body = solids.join(parts)
+    body = solids.join_meshes(parts)
     return body.transformed(solids.yaw_rotation(heading), (position[0], position[1], -lowest))
 
 

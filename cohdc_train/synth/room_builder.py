@@ -131,7 +131,7 @@ class RoomBuilder:
                 size[2] + 0.02 + thing[2] / 2,
             )
             parts.append(self.small_object(place, thing))
-        self.parts.append(solids.join(parts).transformed(turn, (x, y, 0.0)))
+        self.parts.append(solids.join_meshes(parts).transformed(turn, (x, y, 0.0)))
         self.add_footprint(x, y, size, yaw)
 
     def small_object(self, place: tuple[float, float, float], size: FloatArray) -> Mesh:
@@ -200,7 +200,11 @@ class RoomBuilder:
         footprints = np.array(self.footprints, dtype=np.float32).reshape(-1, 4)
         _shade_floor(self.textures[self.floor], footprints, self.size)
         return Room(
-            self.size, solids.join(self.parts), tuple(self.textures), self.lighting(), footprints
+            self.size,
+            solids.join_meshes(self.parts),
+            tuple(self.textures),
+            self.lighting(),
+            footprints,
         )
 
 

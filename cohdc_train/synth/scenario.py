@@ -8,22 +8,18 @@ import cv2
 import numpy as np
 
 from cohdc_train.errors import DataError
-from cohdc_train.synth import furniture
 from cohdc_train.synth import people as bodies
-from cohdc_train.synth import walk_paths as walks
-from cohdc_train.synth.actors import Actor, MovableObject, SeatedPerson, Walker
+from cohdc_train.synth.actor_factory import EYE_Y, ActorFactory
+from cohdc_train.synth.actors import Actor
 from cohdc_train.synth.camera_motion import (
     CameraMotion,
     camera_path,
-    loop_heading,
-    sway,
 )
-from cohdc_train.synth.mesh import join
+from cohdc_train.synth.mesh import join_meshes
 from cohdc_train.synth.random_streams import stream
 from cohdc_train.synth.renderer import Atlas, RenderCamera, RenderedView, render
 from cohdc_train.synth.room import Room
 from cohdc_train.synth.room_layouts import furnished_room, loop_room, plain_room, texture_detail
-from cohdc_train.synth.walk_paths import Walk
 from cohdc_train.types import FloatArray
 
 Action = Literal["walk", "stop_and_go", "fill_view", "sit"]
@@ -35,9 +31,6 @@ PEAK = 0.62  # share that no frame should exceed
 EMPTY = 0.2  # share of the frames that may show nearly no actor
 _COARSE_BIAS = 0.87  # exact share over coarse share, where each point fills a whole pixel
 _MAX_DRAWS = 24  # of the paths, to reach these shares
-# m beyond the view's border where people turn
-_TURN_MARGIN = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}
-_EYE_Y = 0.9  # m from the wall behind the camera
 
 
 @dataclass(frozen=True)
@@ -102,88 +95,15 @@ class RenderedScene:
             [*self.room.textures, *(look for actor in self.actors for look in actor.textures)]
         )
 
-    def view(self, frame: int, atlas: Atlas) -> RenderedView:
+    def render_frame(self, frame: int, atlas: Atlas) -> RenderedView:
         """Render a frame as a perfect camera sees it; actors are instances 1.. in their order."""
         meshes, first = [self.room.mesh], len(self.room.textures)
         for k, actor in enumerate(self.actors):
-            meshes.append(actor.mesh(frame).named(k + 1, first))
+            meshes.append(actor.mesh(frame).as_instance(k + 1, first))
             first += len(actor.textures)
-        return render(join(meshes), atlas, self.room.lighting, self.camera, self.poses[frame])
-
-
-@dataclass(frozen=True)
-class _ActorFactory:
-    """Draws actors and their paths.
-
-    Attributes:
-        rng: random numbers.
-        times: [n] s, of the frames.
-        poses: [n, 4, 4] T_wc of the frames, m.
-        motion: of the camera.
-    """
-
-    rng: np.random.Generator
-    times: FloatArray
-    poses: FloatArray
-    motion: CameraMotion
-
-    def crowd(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """Return people who cross the view; in a loop they walk round with the camera."""
-        if not people:
-            return []
-        ways = walks.crowd(self.rng, self.times, distances, _TURN_MARGIN[self.motion])
-        if self.motion == "loop":
-            ways = walks.follow_camera(
-                ways, self.times, self.poses[:, :2, 3], loop_heading(self.times)
-            )
-        else:
-            ways = tuple(way.transformed(0.0, _EYE_Y) for way in ways)
-        return [Walker(person, way) for person, way in zip(people, ways, strict=True)]
-
-    def stopping(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """Return people who stop and go."""
-        ways = walks.stop_and_go(self.rng, self.times, distances)
-        return [
-            Walker(person, way.transformed(0.0, _EYE_Y))
-            for person, way in zip(people, ways, strict=True)
-        ]
-
-    def filling(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """Return one person before the camera, and others who cross behind."""
-        first = [
-            Walker(person, walks.approach_camera(self.times, self.poses)) for person in people[:1]
-        ]
-        return [*first, *self.crowd(people[1:], distances[1:] + 0.6)]
-
-    def seated(self, people: list[bodies.Person], distances: FloatArray) -> list[Actor]:
-        """Return people on chairs side by side, more or less turned to the camera; then chairs."""
-        sitters: list[Actor] = []
-        chairs: list[Actor] = []
-        still = np.zeros(len(self.times))
-        sides = np.linspace(-0.38, 0.38, len(people)) if len(people) > 1 else np.zeros(1)
-        for person, side, distance in zip(
-            people, self.rng.permutation(sides), distances, strict=True
-        ):
-            place = (float(side * distance), float(distance + _EYE_Y))
-            heading = float(np.arctan2(-1.0, -side) + self.rng.uniform(-0.7, 0.7))
-            fidget = sway(self.rng, self.times, 1.0, 3.0)
-            gesture = np.clip(4 * sway(self.rng, self.times, 1.0, 6.0) - 3, 0, 1)
-            sitters.append(SeatedPerson(person, place, heading, fidget, gesture))
-            chair = furniture.chair(bodies.seat_height(person, bodies.sitting(0.0, 0.0)))
-            rest = Walk(np.tile(place, (len(still), 1)), still + heading, still, still)
-            chairs.append(MovableObject(chair, (furniture.chair_texture(self.rng),), rest))
-        return [*sitters, *chairs]
-
-    def rolling(self, pusher: list[bodies.Person], distance: float) -> list[Actor]:
-        """Return a cart, and the person who pushes it."""
-        body, looks = furniture.cart(self.rng)
-        line = walks.back_and_forth(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
-        way, behind = walks.cart_path(self.rng, self.times, line, furniture.HANDLE - 0.5)
-        ways = [walk.transformed(0.0, distance + _EYE_Y) for walk in (way, behind)]
-        return [
-            *(Walker(person, ways[1], pushes=True) for person in pusher),
-            MovableObject(body, looks, ways[0]),
-        ]
+        return render(
+            join_meshes(meshes), atlas, self.room.lighting, self.camera, self.poses[frame]
+        )
 
 
 def draw_scene(
@@ -220,10 +140,10 @@ def draw_scene(
         setting,
     )
     fine = np.arange(POSES_PER_FRAME * (frames - 1) + 1) / (RATE * POSES_PER_FRAME)
-    middle = room.size[1] / 2 if motion == "loop" else _EYE_Y
+    middle = room.size[1] / 2 if motion == "loop" else EYE_Y
     truth = camera_path(rng, fine, motion, np.array([0.0, middle, rng.uniform(1.25, 1.5)]))
     cast = [bodies.draw_person(rng, patterned=1.0) for _ in range(people)]
-    factory = _ActorFactory(rng, fine[::POSES_PER_FRAME], truth[::POSES_PER_FRAME], motion)
+    factory = ActorFactory(rng, fine[::POSES_PER_FRAME], truth[::POSES_PER_FRAME], motion)
     is_empty = people == 0 and setting.cart == "none"
     metered = tuple(k * frames // 5 for k in range(5)) if motion == "loop" else (0,)
     is_fitted = not is_empty and setting.action != "fill_view"
@@ -258,7 +178,7 @@ def _room(
 
 
 def _actors(
-    factory: _ActorFactory, setting: SceneConfig, cast: list[bodies.Person], nearest: float
+    factory: ActorFactory, setting: SceneConfig, cast: list[bodies.Person], nearest: float
 ) -> tuple[Actor, ...]:
     """Return all actors, the nearest `nearest` m from the eye: people first, objects last."""
     pushers = 1 if setting.cart == "pushed" else 0

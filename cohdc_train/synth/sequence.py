@@ -101,10 +101,12 @@ def _write_frames(folder: Path, scene: RenderedScene, seed: int) -> tuple[FloatA
         (folder / name).mkdir()
     rng = stream(seed, "sequence", 2)
     atlas, frames = scene.atlas(), len(scene.poses)
-    gain = np.float32(np.mean([exposure_gain(scene.view(k, atlas).rgb) for k in scene.metered]))
+    gain = np.float32(
+        np.mean([exposure_gain(scene.render_frame(k, atlas).rgb) for k in scene.metered])
+    )
     shares = []
     for k, timestamp in enumerate(timestamps(frames)):
-        view = scene.view(k, atlas)
+        view = scene.render_frame(k, atlas)
         rgb = add_sensor_noise(view.rgb * gain, rng, blur=0.6 * scene.camera.width / 640)
         person = np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance]
         moves = np.array(

@@ -12,7 +12,8 @@ SATURATION = 0.35  # rooms are painted in calmer colors than people are dressed 
 def noise(rng: np.random.Generator, height: int, width: int, coarsest: int = 4) -> Float32Array:
     """Draw smooth noise of several octaves, [height, width], of mean 0 and deviation 1."""
     total = np.zeros((height, width), dtype=np.float32)
-    cells, weight = coarsest, 1.0
+    cells = coarsest
+    weight = 1.0
     while cells <= min(height, width):
         rough = rng.normal(size=(cells, cells)).astype(np.float32)
         total += weight * cv2.resize(rough, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -56,17 +57,29 @@ def solid(height: int, width: int, rgb: Float32Array) -> Float32Array:
     return np.tile(rgb.astype(np.float32), (height, width, 1))
 
 
+def _draw(rng: np.random.Generator, low: int, high: int) -> int:
+    """Draw a whole number in low..high - 1."""
+    return int(rng.integers(low, high))
+
+
+def _random_point(rng: np.random.Generator, width: int, height: int) -> tuple[int, int]:
+    """Draw a pixel (x, y) of an image."""
+    x = int(rng.integers(width))
+    y = int(rng.integers(height))
+    return x, y
+
+
 def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw a painted wall with marks: short scratches, filled holes, stains."""
     image = solid(height, width, random_color(rng, 110, 225))
-    for _ in range(int(rng.integers(60, 130))):
-        x, y = int(rng.integers(width)), int(rng.integers(height))
+    for _ in range(_draw(rng, 60, 130)):
+        x, y = _random_point(rng, width, height)
         shade = to_ink(np.clip(image[y, x] + rng.normal(0, 55), 0, 255))
         if rng.random() < 0.5:
             end = (x + int(rng.normal(0, width / 30)), y + int(rng.normal(0, height / 30)))
-            cv2.line(image, (x, y), end, shade, int(rng.integers(1, 3)), cv2.LINE_AA)
+            cv2.line(image, (x, y), end, shade, _draw(rng, 1, 3), cv2.LINE_AA)
         else:
-            radius = int(rng.integers(1, max(width // 90, 3)))
+            radius = _draw(rng, 1, max(width // 90, 3))
             cv2.circle(image, (x, y), radius, shade, -1, cv2.LINE_AA)
     return add_dirt(image, rng, 7, 12)
 
@@ -78,13 +91,14 @@ def paint(rng: np.random.Generator, height: int, width: int) -> Texture:
 
 def brick(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw bricks in mortar, each with a shade of its own."""
-    rows = int(rng.integers(14, 24))
-    columns = int(rng.integers(9, 16))
+    rows = _draw(rng, 14, 24)
+    columns = _draw(rng, 9, 16)
     image = solid(height, width, random_color(rng, 120, 210))
     base = random_color(rng, 60, 190)
     gap = max(width // 250, 1)
     for r in range(rows):
-        top, bottom = r * height // rows + gap, (r + 1) * height // rows - gap
+        top = r * height // rows + gap
+        bottom = (r + 1) * height // rows - gap
         offset = 0.5 * (r % 2)
         for c in range(-1, columns):
             left = int((c + offset) * width / columns) + gap
@@ -96,7 +110,7 @@ def brick(rng: np.random.Generator, height: int, width: int) -> Texture:
 
 def tiles(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw a checker of two colors whose tiles differ slightly, with joints."""
-    count = int(rng.integers(5, 13))
+    count = _draw(rng, 5, 13)
     pair = np.stack([random_color(rng, 40, 225), random_color(rng, 40, 225)])
     row = np.arange(height) * count // height
     column = np.arange(width) * count // width
@@ -111,22 +125,23 @@ def tiles(rng: np.random.Generator, height: int, width: int) -> Texture:
 
 def wood_texture(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw planks with grain along u, board ends and knots."""
-    boards = int(rng.integers(3, 9))
+    boards = _draw(rng, 3, 9)
     red, green, blue = rng.uniform(90, 190), rng.uniform(60, 140), rng.uniform(30, 95)
     base = np.array([red, green, blue], dtype=np.float32)
     image = np.zeros((height, width, 3), dtype=np.float32)
     for b in range(boards):
-        top, bottom = b * height // boards, (b + 1) * height // boards
+        top = b * height // boards
+        bottom = (b + 1) * height // boards
         board = (width, bottom - top)
         grain = cv2.resize(noise(rng, 64, 16, 8), board, interpolation=cv2.INTER_CUBIC)
         image[top:bottom] = base + rng.normal(0, 14) + grain[..., None] * 12
         image[top : top + max(height // 200, 1)] *= 0.45
         end = int(rng.integers(width))
         image[top:bottom, end : end + max(width // 200, 1)] *= 0.45
-        for _ in range(int(rng.integers(1, 5))):
-            knot = (int(rng.integers(width)), int(rng.integers(top, bottom)))
-            half_width = int(rng.integers(2, max(width // 40, 3)))
-            half_height = int(rng.integers(2, max(height // 80, 3)))
+        for _ in range(_draw(rng, 1, 5)):
+            knot = (int(rng.integers(width)), _draw(rng, top, bottom))
+            half_width = _draw(rng, 2, max(width // 40, 3))
+            half_height = _draw(rng, 2, max(height // 80, 3))
             axes = (half_width, half_height)
             cv2.ellipse(image, knot, axes, 0, 0, 360, to_ink(base * 0.5), -1, cv2.LINE_AA)
     return add_dirt(image, rng, 6, 6)
@@ -134,8 +149,9 @@ def wood_texture(rng: np.random.Generator, height: int, width: int) -> Texture:
 
 def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw stripes with a motif that changes its color and size from place to place."""
-    ground, stripe = random_color(rng, 90, 225), random_color(rng, 60, 225)
-    period = int(rng.integers(width // 14, width // 6))
+    ground = random_color(rng, 90, 225)
+    stripe = random_color(rng, 60, 225)
+    period = _draw(rng, width // 14, width // 6)
     is_ground = (np.arange(width) // max(period // 2, 1)) % 2 == 0
     row = np.where(is_ground[None, :, None], ground, stripe)
     stripes = np.broadcast_to(row, (height, width, 3))
@@ -144,8 +160,8 @@ def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
     for y in range(step // 2, height, step):
         for x in range(step // 2, width, step):
             ink = random_ink(rng, 20, 235)
-            radius = int(rng.integers(max(step // 8, 2), max(step // 3, 4)))
-            sides = int(rng.integers(3, 8))
+            radius = _draw(rng, max(step // 8, 2), max(step // 3, 4))
+            sides = _draw(rng, 3, 8)
             angle = np.linspace(0, 2 * np.pi, sides, endpoint=False) + rng.uniform(0, 6)
             outline = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], 1)
             cv2.fillPoly(image, [outline.astype(np.int32)], ink, cv2.LINE_AA)
@@ -155,9 +171,10 @@ def wallpaper(rng: np.random.Generator, height: int, width: int) -> Texture:
 def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw a speckled carpet with a woven pattern of rectangles."""
     image = solid(height, width, random_color(rng, 50, 170))
-    for _ in range(int(rng.integers(25, 60))):
-        x, y = int(rng.integers(width)), int(rng.integers(height))
-        w, h = int(rng.integers(4, max(width // 8, 6))), int(rng.integers(4, max(height // 8, 6)))
+    for _ in range(_draw(rng, 25, 60)):
+        x, y = _random_point(rng, width, height)
+        w = _draw(rng, 4, max(width // 8, 6))
+        h = _draw(rng, 4, max(height // 8, 6))
         ink = random_ink(rng, 40, 190)
         thickness = int(rng.choice([-1, 2, 3]))
         cv2.rectangle(image, (x, y), (x + w, y + h), ink, thickness)
@@ -167,17 +184,17 @@ def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
 def poster_texture(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw random shapes and lines of letters in a frame."""
     image = solid(height, width, random_color(rng, 30, 235))
-    for _ in range(int(rng.integers(8, 22))):
+    for _ in range(_draw(rng, 8, 22)):
         ink = random_ink(rng, 10, 245)
-        count = int(rng.integers(3, 6))
+        count = _draw(rng, 3, 6)
         shape = rng.uniform(0, 1, (count, 2)) * rng.uniform(0.2, 0.7)
         corners = shape + rng.uniform(-0.1, 0.8, 2)
         cv2.fillPoly(image, [(corners * [width, height]).astype(np.int32)], ink, cv2.LINE_AA)
-        center = (int(rng.integers(width)), int(rng.integers(height)))
-        radius = int(rng.integers(2, max(width // 7, 4)))
+        center = _random_point(rng, width, height)
+        radius = _draw(rng, 2, max(width // 7, 4))
         thickness = int(rng.choice([-1, 2]))
         cv2.circle(image, center, radius, ink[::-1], thickness, cv2.LINE_AA)
-    write_letters(image, rng, int(rng.integers(1, 6)))
+    write_letters(image, rng, _draw(rng, 1, 6))
     edge = max(width // 32, 2)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), random_ink(rng, 10, 120), 2 * edge)
     return add_dirt(image, rng, 5, 4)
@@ -185,20 +202,21 @@ def poster_texture(rng: np.random.Generator, height: int, width: int) -> Texture
 
 def books(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw shelves filled with book spines of many heights and colors."""
-    shelves = int(rng.integers(3, 6))
+    shelves = _draw(rng, 3, 6)
     image = solid(height, width, random_color(rng, 30, 90))
     for s in range(shelves):
         board = max(height // 60, 2)
-        top, bottom = s * height // shelves, (s + 1) * height // shelves - board
+        top = s * height // shelves
+        bottom = (s + 1) * height // shelves - board
         x = 0
         while x < width:
-            thick = int(rng.integers(max(width // 50, 3), max(width // 16, 6)))
+            thick = _draw(rng, max(width // 50, 3), max(width // 16, 6))
             tall = int((bottom - top) * rng.uniform(0.55, 0.95))
             image[bottom - tall : bottom, x : x + thick] = random_color(rng, 20, 235)
             band = bottom - int(tall * rng.uniform(0.3, 0.9))
             band_end = band + max(tall // 9, 1)
             image[band:band_end, x + 1 : x + thick - 1] = random_color(rng, 20, 245)
-            x += thick + int(rng.integers(0, 3))
+            x += thick + _draw(rng, 0, 3)
         image[bottom : bottom + board] = random_color(rng, 80, 160)
     return add_dirt(image, rng, 5, 4)
 
@@ -206,8 +224,9 @@ def books(rng: np.random.Generator, height: int, width: int) -> Texture:
 def screen(rng: np.random.Generator, height: int, width: int) -> Texture:
     """Draw a monitor: bezel, windows and text."""
     image = solid(height, width, random_color(rng, 20, 160))
-    for _ in range(int(rng.integers(2, 5))):
-        x, y = int(rng.integers(0, width * 2 // 3)), int(rng.integers(0, height * 2 // 3))
+    for _ in range(_draw(rng, 2, 5)):
+        x = _draw(rng, 0, width * 2 // 3)
+        y = _draw(rng, 0, height * 2 // 3)
         ink = random_ink(rng, 150, 250)
         cv2.rectangle(image, (x, y), (x + width // 3, y + height // 3), ink, -1)
     write_letters(image, rng, 9)
@@ -219,10 +238,11 @@ def carton_texture(rng: np.random.Generator, height: int, width: int) -> Texture
     """Draw a painted or cardboard face with tape, labels and print."""
     image = solid(height, width, random_color(rng, 60, 215))
     image[:, width // 2 - width // 20 : width // 2 + width // 20] *= 0.8
-    for _ in range(int(rng.integers(2, 6))):
-        x, y = int(rng.integers(0, width * 3 // 4)), int(rng.integers(0, height * 3 // 4))
-        label_width = int(rng.integers(width // 10, width // 3))
-        label_height = int(rng.integers(height // 10, height // 3))
+    for _ in range(_draw(rng, 2, 6)):
+        x = _draw(rng, 0, width * 3 // 4)
+        y = _draw(rng, 0, height * 3 // 4)
+        label_width = _draw(rng, width // 10, width // 3)
+        label_height = _draw(rng, height // 10, height // 3)
         end = (x + label_width, y + label_height)
         cv2.rectangle(image, (x, y), end, random_ink(rng, 20, 245), -1)
     write_letters(image, rng, 4)
@@ -234,8 +254,8 @@ def write_letters(image: Float32Array, rng: np.random.Generator, lines: int) -> 
     height, width = image.shape[:2]
     alphabet = list("ABCDEFGHKLMNPRSTUVXYZ0123456789abdefghknprt#%&")
     for _ in range(lines):
-        text = "".join(rng.choice(alphabet, int(rng.integers(4, 14))))
-        place = (int(rng.integers(0, width * 2 // 3)), int(rng.integers(height // 8, height)))
+        text = "".join(rng.choice(alphabet, _draw(rng, 4, 14)))
+        place = (_draw(rng, 0, width * 2 // 3), _draw(rng, height // 8, height))
         scale = float(rng.uniform(0.25, 1.1) * width / 256)
         write(image, text, place, scale, random_color(rng, 5, 250))
 
@@ -247,7 +267,8 @@ def write(
 
     OpenCV writes on uint8 only.
     """
-    top, bottom = max(place[1] - int(40 * scale) - 2, 0), place[1] + int(16 * scale) + 2
+    top = max(place[1] - int(40 * scale) - 2, 0)
+    bottom = place[1] + int(16 * scale) + 2
     rows = image[top:bottom]
     stencil = np.zeros(rows.shape[:2], dtype=np.uint8)
     place, thick = (place[0], place[1] - top), max(int(2.2 * scale), 1)

@@ -32,7 +32,7 @@ class Walk:
     distance_walked: FloatArray
     pace: FloatArray
 
-    def transformed(self, x: float, y: float) -> "Walk":
+    def shifted(self, x: float, y: float) -> "Walk":
         """Return the path shifted by `x` and `y` m."""
         return replace(self, position=self.position + np.array([x, y]))
 

@@ -38,8 +38,9 @@ def draw_image(path: Path, rows: list[dict[str, Any]], seed: int) -> None:
 
 
 def content(images: Path, name: str, count: int) -> dict[str, Any]:
-    """`count` images, each with a person and a car; draws them into the folder. Those of "val" look
-    different.
+    """Draw `count` images with a person and a car each, and return their COCO dict.
+
+    Those of "val" look different.
     """
     rows, files = [], []
     other = name == "val"
@@ -64,7 +65,7 @@ def write(path: Path, value: Any) -> Path:
 
 
 def folder(root: Path, train: int = 6, val: int = 2) -> Path:
-    """`images/` + `instances_{train,val}.json`."""
+    """Write `images/` and `instances_{train,val}.json`."""
     for name, count in (("train", train), ("val", val)):
         write(root / f"instances_{name}.json", content(root / "images", name, count))
     return root

@@ -1,4 +1,4 @@
-"""Canvas from image sizes."""
+"""Canvas size chosen from image sizes."""
 
 from hypothesis import given
 from hypothesis import strategies as st

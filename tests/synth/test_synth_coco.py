@@ -1,6 +1,4 @@
-"""The COCO-format set: readable by pycocotools, exact, reproducible, with splits that share
-nothing.
-"""
+"""COCO-format sets: readable by pycocotools, exact, repeatable, with disjoint splits."""
 
 import hashlib
 import json
@@ -81,10 +79,10 @@ def test_annotations_are_the_rendered_masks(folder: Path) -> None:
     api = pycocotools.COCO(folder / "instances_train.json")
     seen = 0
     for image_id in (1, 2, 3, 4, 5):
-        picture: LabeledImage = render_image(room_with_people, rng, SIZE)
+        rendered: LabeledImage = render_image(room_with_people, rng, SIZE)
         annotations = api.loadAnns(sorted(api.getAnnIds(image_id)))
-        assert len(annotations) == len(picture.masks)
-        for annotation, mask in zip(annotations, picture.masks, strict=True):
+        assert len(annotations) == len(rendered.masks)
+        for annotation, mask in zip(annotations, rendered.masks, strict=True):
             np.testing.assert_array_equal(api.annToMask(annotation).astype(bool), mask)
             seen += 1
     assert seen > 0

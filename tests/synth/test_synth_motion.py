@@ -1,6 +1,4 @@
-"""Camera paths and walks: smooth, within their reach, out of sight when they jump, at rest when
-they should be.
-"""
+"""Camera paths and walks: smooth, within their reach, and out of sight when they jump."""
 
 import numpy as np
 import pytest
@@ -80,7 +78,7 @@ def test_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: int
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Degrees between two rotations."""
+    """Return the degrees between two rotations."""
     return float(np.degrees(np.arccos(np.clip((np.trace(first.T @ second) - 1) / 2, -1, 1))))
 
 

@@ -1,4 +1,4 @@
-"""Bodies: on the floor, as tall as they say, articulated, facing outwards."""
+"""Bodies: on the floor, of the right height, articulated, with outward normals."""
 
 import numpy as np
 import pytest

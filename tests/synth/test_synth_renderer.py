@@ -1,4 +1,4 @@
-"""Depth, instances and colors of the ray caster against what plane and sphere geometry say."""
+"""Depth, instances and colors of the ray caster against the geometry of planes and spheres."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_depth_of_a_plane(
 
 
 def test_ball_covers_its_circle_in_instance_image() -> None:
-    ball = solids.ellipsoid((0, 0, 3), (0.5, 0.5, 0.5), 0).named(7, 0)
+    ball = solids.ellipsoid((0, 0, 3), (0.5, 0.5, 0.5), 0).as_instance(7, 0)
     camera = RenderCamera(200, 200, 99.5, 99.5, 200, 200)
     found = render(ball, Atlas([GRAY] * 8), LIGHT, camera, looking_at_z()).instance
     assert set(np.unique(found)) == {0, 7}
@@ -58,9 +58,9 @@ def test_ball_covers_its_circle_in_instance_image() -> None:
 
 
 def test_nearest_instance_is_visible_and_background_is_zero() -> None:
-    near = solids.quad((-0.2, -0.2, 1), (0.4, 0, 0), (0, 0.4, 0), 0).named(2, 0)
-    far = solids.quad((-0.6, -0.6, 2), (1.2, 0, 0), (0, 1.2, 0), 0).named(1, 0)
-    view = render(solids.join([far, near]), Atlas([GRAY]), LIGHT, CAMERA, looking_at_z())
+    near = solids.quad((-0.2, -0.2, 1), (0.4, 0, 0), (0, 0.4, 0), 0).as_instance(2, 0)
+    far = solids.quad((-0.6, -0.6, 2), (1.2, 0, 0), (0, 1.2, 0), 0).as_instance(1, 0)
+    view = render(solids.join_meshes([far, near]), Atlas([GRAY]), LIGHT, CAMERA, looking_at_z())
     assert view.instance[30, 40] == 2
     assert view.depth[30, 40] == pytest.approx(1.0, abs=1e-5)
     assert view.instance[15, 40] == 1
@@ -78,7 +78,7 @@ def test_texture_is_upright_at_every_distance() -> None:
         wall = solids.quad((-1, -1, distance), (2, 0, 0), (0, 2, 0), 0)
         view = render(wall, Atlas([GRAY, texture]), LIGHT, CAMERA, looking_at_z())
         assert view.rgb.max() < 0.6, "the first texture is gray"
-        view = render(wall.named(0, 1), Atlas([GRAY, texture]), LIGHT, CAMERA, looking_at_z())
+        view = render(wall.as_instance(0, 1), Atlas([GRAY, texture]), LIGHT, CAMERA, looking_at_z())
         u, v = CAMERA.fx * 0.4 / distance, CAMERA.fy * 0.4 / distance
         right, left = int(CAMERA.cx + u), int(CAMERA.cx - u)
         top, bottom = int(CAMERA.cy - v), int(CAMERA.cy + v)

@@ -1,6 +1,4 @@
-"""What a scene promises: who is seen how much, what moves and what does not, and the same bytes for
-the same seed.
-"""
+"""Scenes: visible share of actors, moving and static ones, and repeatability for a seed."""
 
 import hashlib
 import itertools
@@ -33,11 +31,11 @@ def scene_of(
 
 def views(scene: RenderedScene, step: int) -> list[RenderedView]:
     atlas = scene.atlas()
-    return [scene.view(k, atlas) for k in range(0, len(scene.poses), step)]
+    return [scene.render_frame(k, atlas) for k in range(0, len(scene.poses), step)]
 
 
 def people_in(scene: RenderedScene, view: RenderedView) -> float:
-    """Share of the pixels on people."""
+    """Return the share of the pixels on people."""
     return float(
         np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance].mean()
     )
@@ -144,7 +142,7 @@ def test_seated_people_hardly_move_and_chairs_stay() -> None:
 def test_plain_walls_give_few_corners() -> None:
     def corners(walls: str) -> int:
         scene = draw_scene(7, 2, (240, 320), "static", 0, SceneConfig(walls=walls))  # type: ignore[arg-type]
-        view = scene.view(0, scene.atlas())
+        view = scene.render_frame(0, scene.atlas())
         upper = np.clip(view.rgb[:120] / view.rgb.mean() * 90, 0, 255).astype(np.uint8)
         return len(cv2.FastFeatureDetector_create(12).detect(upper))
 
@@ -161,16 +159,16 @@ def test_loop_sees_furniture_in_every_direction_and_its_first_view_again(
 ) -> None:
     atlas, camera = loop.atlas(), RenderCamera.freiburg3((96, 128))
 
-    def picture(k: int) -> RenderedView:
+    def render_frame(k: int) -> RenderedView:
         return render(loop.room.mesh, atlas, loop.room.lighting, camera, loop.poses[k])
 
-    first, half, last = (picture(k) for k in (0, 140, 299))
+    first, half, last = (render_frame(k) for k in (0, 140, 299))
     other_way, again = (
         float(np.median(np.abs(first.depth - later.depth))) for later in (half, last)
     )
     assert again < 0.1
     assert other_way > 0.25
-    for view in map(picture, range(0, 300, 40)):
+    for view in map(render_frame, range(0, 300, 40)):
         assert view.depth.max() < 6, "within the sensor's reach, or nearly"
         assert view.rgb.std() > 0.1 * view.rgb.mean()
 

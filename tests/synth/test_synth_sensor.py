@@ -1,4 +1,4 @@
-"""The sensor model: the noise it says, holes where it says."""
+"""Sensor model: noise and holes."""
 
 import numpy as np
 import pytest

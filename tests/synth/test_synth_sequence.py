@@ -1,4 +1,4 @@
-"""The RGB-D sequence: TUM's layout to the letter, and truth that agrees with the pixels."""
+"""RGB-D sequences: TUM's layout, and ground truth that agrees with the pixels."""
 
 import hashlib
 import json
@@ -108,13 +108,13 @@ def test_masks_are_binary_and_info_has_their_share(folder: Path) -> None:
 
 def test_masks_are_the_rendered_people(folder: Path) -> None:
     scene = draw_scene(4, FRAMES, SIZE, "xyz", 3)
-    view = scene.view(7, scene.atlas())
+    view = scene.render_frame(7, scene.atlas())
     masks = sorted((folder / "masks").iterdir())
     np.testing.assert_array_equal(cv2.imread(str(masks[7]), 0) == 255, view.instance > 0)
 
 
 def test_groundtruth_maps_depth_between_frames(folder: Path) -> None:
-    """Static pixels of the first frame, moved by groundtruth.txt, meet the depth of the last one."""
+    """Static pixels of the first frame, moved by groundtruth.txt, meet the depth of the last."""
     camera = yaml.safe_load((folder / "camera.yaml").read_text())
     K = np.array([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     truth = np.array(rows(folder / "groundtruth.txt"), dtype=float)
@@ -178,7 +178,9 @@ def test_wall_depth_follows_geometry_of_room() -> None:
 def test_people_cover_a_fifth_to_two_fifths(seed: int) -> None:
     scene = draw_scene(seed, 240, SIZE, "xyz", 3)
     coarse, atlas = replace(scene, camera=scene.camera.resized(0.5)), scene.atlas()
-    shares = np.array([(coarse.view(k, atlas).instance > 0).mean() for k in range(0, 240, 12)])
+    shares = np.array(
+        [(coarse.render_frame(k, atlas).instance > 0).mean() for k in range(0, 240, 12)]
+    )
     assert 0.2 < shares.mean() < 0.4
     assert shares.max() < 0.68
 
@@ -217,10 +219,10 @@ def test_invalid_arguments_are_refused_in_one_line(
 
 
 def test_import_of_synth_is_cheap() -> None:
-    code = "import sys, cohdc_train.synth; print([m for m in ('embreex', 'torch', 'scipy') if m in sys.modules])"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout
-        == "[]\n"
+    code = (
+        "import sys, cohdc_train.synth;"
+        "print([name for name in ('embreex', 'torch', 'scipy') if name in sys.modules])"
     )
+    command = [sys.executable, "-c", code]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert printed == "[]\n"

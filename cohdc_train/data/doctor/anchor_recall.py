@@ -57,7 +57,9 @@ def best_overlap(boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, in
     return best
 
 
-def recall(boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, int]) -> list[AnchorRecall]:
+def anchor_recall(
+    boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, int]
+) -> list[AnchorRecall]:
     """Return the share of objects that anchors cover, by the objects' size.
 
     Sizes without objects are skipped. RPN training calls an anchor positive from an IoU of .7 on,

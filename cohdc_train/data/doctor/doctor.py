@@ -10,7 +10,7 @@ import yaml
 
 from cohdc_train.data.canvas import choose_canvas
 from cohdc_train.data.coco import CocoSplit, read_split
-from cohdc_train.data.doctor.anchor_recall import recall
+from cohdc_train.data.doctor.anchor_recall import anchor_recall
 from cohdc_train.data.doctor.sample_grid import draw_grid
 from cohdc_train.data.doctor.split_checks import SplitReport, check_split
 from cohdc_train.data.image_files import mirror_fingerprints
@@ -55,10 +55,10 @@ def doctor(
         print(
             f"{split.name}: {split.files.annotations}: {usable}, {len(split.removed)} rows cannot"
         )
-        print("\n".join(split.issues.lines()) or "  nothing found")
+        print("\n".join(split.issues.summary_lines()) or "  nothing found")
     if fix is not None:
         _write_fixed(splits, fix)
-    wrong = {split.name: split.issues.of("error") for split in splits}
+    wrong = {split.name: split.issues.of_severity("error") for split in splits}
     if out is not None:
         claim_folder(out, _VERB, ["issues.json", "annotations.jpg"])
         write_json(out / "issues.json", {split.name: split.issues.places for split in splits})
@@ -82,14 +82,14 @@ def stats(root: Path, classes: list[str] | None = None) -> None:
     """
     splits = [read_split(name, find_split(root, name), classes) for name in _SPLITS]
     for split in splits:
-        for name, value in count(split).items():
+        for name, value in count_objects(split).items():
             print(f"{split.name:<6}{name:<24}{value}")
     if set(splits[0].class_names) != set(splits[1].class_names):
         train, val = (split.class_names for split in splits)
         raise DataError(f"{root}: the classes of train and val differ: {train} {val}")
 
 
-def count(split: CocoSplit) -> dict[str, Any]:
+def count_objects(split: CocoSplit) -> dict[str, Any]:
     """Return the counts of one split, named as in Table 3 of the paper, and of each class."""
     objects = [o for image in split.images for o in image.objects]
     per_class = Counter(split.class_names[o.label - 1] for o in objects if not o.crowd)
@@ -108,36 +108,47 @@ def count(split: CocoSplit) -> dict[str, Any]:
 
 def summary(split: CocoSplit) -> str:
     """Return the counts of one split that are not zero, in one line."""
-    shown = [
-        f"{name} {value}" for name, value in count(split).items() if name != "annotations" and value
-    ]
-    return f"{split.name}: {'; '.join(shown[:_SHOWN])}" + ("; ..." if len(shown) > _SHOWN else "")
+    counts = {name: value for name, value in count_objects(split).items() if name != "annotations"}
+    shown = [f"{name} {value}" for name, value in counts.items() if value]
+    more = "; ..." if len(shown) > _SHOWN else ""
+    return f"{split.name}: {'; '.join(shown[:_SHOWN])}{more}"
 
 
 def _compare_splits(train: SplitReport, val: SplitReport) -> None:
     """Add issues between the splits: classes that differ, and images that are in both."""
-    names = [
-        {row["id"]: str(row["name"]) for row in split.content["categories"]}
-        for split in (train, val)
-    ]
-    for here, there, split in ((names[0], names[1], train), (names[1], names[0], val)):
-        for missing in sorted(set(here.values()) - set(there.values())):
-            split.issues.add("classes-differ", missing)
-    used = [
-        {known.get(row["category_id"]) for row in split.content["annotations"]}
-        for known, split in zip(names, (train, val), strict=True)
-    ]
-    for name in sorted(used[1] - used[0] & used[1], key=str):
-        val.issues.add("class-only-val", str(name))
-    if not train.fingerprints or not val.fingerprints:
-        return
-    ours, theirs = (np.stack(list(split.fingerprints.values())) for split in (train, val))
-    flipped = mirror_fingerprints(theirs)
-    train_names, val_names = list(train.fingerprints), list(val.fingerprints)
-    for i, one in enumerate(ours):
-        alike = np.maximum(theirs @ one, flipped @ one)
-        for j in np.nonzero(alike > _SAME_IMAGE)[0]:
-            train.issues.add("leak", f"{train_names[i]} = {val_names[j]}")
+    _compare_classes(train, val)
+    if train.fingerprints and val.fingerprints:
+        _find_leaks(train, val)
+
+
+def _compare_classes(train: SplitReport, val: SplitReport) -> None:
+    """Add issues of classes that one split lacks."""
+    in_train, in_val = _category_names(train), _category_names(val)
+    for name in sorted(set(in_train.values()) - set(in_val.values())):
+        train.issues.add("classes-differ", name)
+    for name in sorted(set(in_val.values()) - set(in_train.values())):
+        val.issues.add("classes-differ", name)
+
+    learned = {in_train.get(row["category_id"]) for row in train.content["annotations"]}
+    scored = {in_val.get(row["category_id"]) for row in val.content["annotations"]}
+    for unlearned in sorted(scored - learned, key=str):
+        val.issues.add("class-only-val", str(unlearned))
+
+
+def _category_names(split: SplitReport) -> dict[int, str]:
+    """Return the name of each category id."""
+    return {row["id"]: str(row["name"]) for row in split.content["categories"]}
+
+
+def _find_leaks(train: SplitReport, val: SplitReport) -> None:
+    """Add an issue for each training image that equals a validation image, or its mirror image."""
+    prints = np.stack(list(val.fingerprints.values()))
+    flipped = mirror_fingerprints(prints)
+    val_names = list(val.fingerprints)
+    for name, one in train.fingerprints.items():
+        similarity = np.maximum(prints @ one, flipped @ one)
+        for j in np.nonzero(similarity > _SAME_IMAGE)[0]:
+            train.issues.add("leak", f"{name} = {val_names[j]}")
 
 
 def _write_fixed(splits: Sequence[SplitReport], folder: Path) -> None:
@@ -168,7 +179,7 @@ def _print_statistics(
     origin = "that cohdc fit chooses" if canvas == "auto" else "of --canvas"
     print(f"anchors {list(scales)} on the canvas {origin}, {height}x{width} px, objects of train:")
     boxes = _boxes(train, (height, width))
-    for row in recall(boxes, scales, (height, width)):
+    for row in anchor_recall(boxes, scales, (height, width)):
         shares = f"IoU >= .5: {row.at_50:6.1%}   >= .7: {row.at_70:6.1%}"
         print(f"  {row.size:<8}{row.objects:>7} objects   {shares}")
 

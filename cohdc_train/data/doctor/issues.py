@@ -164,7 +164,7 @@ class Issues:
             raise KeyError(kind)
         self.places.setdefault(kind, []).append(where)
 
-    def of(self, severity: Severity) -> dict[str, list[str]]:
+    def of_severity(self, severity: Severity) -> dict[str, list[str]]:
         """Return the issues of one severity."""
         return {
             kind: where
@@ -172,10 +172,10 @@ class Issues:
             if ISSUE_KINDS[kind].severity == severity
         }
 
-    def lines(self) -> Iterator[str]:
+    def summary_lines(self) -> Iterator[str]:
         """Yield two lines per kind, errors first: severity, count, description, places; fix."""
         for severity in ("error", "warning", "note"):
-            for kind, where in self.of(severity).items():
+            for kind, where in self.of_severity(severity).items():
                 named = list(dict.fromkeys(where))
                 more = f" and {len(named) - 3} more" if len(named) > 3 else ""
                 places = ", ".join(named[:3])

@@ -90,11 +90,7 @@ def _categories(split: SplitReport, given: Sequence[Any]) -> tuple[list[Row], di
     first: dict[str, int] = {}
     join: dict[int, int] = {}
     for row in given:
-        if (
-            not isinstance(row, dict)
-            or not isinstance(row.get("id"), int)
-            or not str(row.get("name") or "").strip()
-        ):
+        if not _is_category(row):
             split.reject("category-broken", f"{row!r:.40}", row)
             continue
         name, number = str(row["name"]), row["id"]
@@ -119,11 +115,7 @@ def _images(
     """Return the sound images by id; and the first id of a file by each other id of it."""
     by_id: dict[Any, list[Row]] = defaultdict(list)
     for row in given:
-        if (
-            not isinstance(row, dict)
-            or not row.get("file_name")
-            or not _whole(row, "id", "width", "height")
-        ):
+        if not _is_image(row):
             split.reject("image-broken", f"{row!r:.60}", row)
         elif row not in by_id[row["id"]]:
             by_id[row["id"]].append(row)
@@ -163,7 +155,7 @@ def _image(split: SplitReport, row: Row, annotations: Sequence[Row]) -> Row | No
         if found:
             split.issues.add(kind, name)
     split.fingerprints[name] = _fingerprint(path)
-    sized = _sized(split, row, file, annotations)
+    sized = _with_file_size(split, row, file, annotations)
     if sized is not None and file.orientation > 1:
         is_turned = file.is_turned((sized["width"], sized["height"]))
         split.issues.add("image-turned" if is_turned else "image-exif", name)
@@ -177,7 +169,9 @@ def _fingerprint(path: Path) -> Float32Array:
         return np.zeros(256, dtype=np.float32)
 
 
-def _sized(split: SplitReport, row: Row, file: ImageFile, annotations: Sequence[Row]) -> Row | None:
+def _with_file_size(
+    split: SplitReport, row: Row, file: ImageFile, annotations: Sequence[Row]
+) -> Row | None:
     """Return the image row under a size at which the file is read; None when no size fits.
 
     A file is read upright, or as stored where that is the only size that fits.
@@ -226,7 +220,7 @@ def _annotations(
         for number, pairs in per_image.items()
         for row in _without_duplicates(split, images[number], pairs)
     ]
-    return _numbered(split, kept, images)
+    return _with_unique_ids(split, kept, images)
 
 
 def _without_duplicates(
@@ -247,7 +241,7 @@ def _without_duplicates(
     return [row for i, (row, _) in enumerate(pairs) if i not in duplicates]
 
 
-def _numbered(split: SplitReport, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
+def _with_unique_ids(split: SplitReport, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
     """Return the annotations with an id each."""
     used: set[int] = set()
     following = max((row["id"] for row in rows if isinstance(row.get("id"), int)), default=0) + 1
@@ -282,5 +276,19 @@ def _note_objects(
             split.issues.add("category-unused", str(row["name"]))
 
 
-def _whole(row: Row, *keys: str) -> bool:
+def _is_category(row: Any) -> bool:
+    """Return whether a row has a whole-number id and a name."""
+    if not isinstance(row, dict) or not isinstance(row.get("id"), int):
+        return False
+    return bool(str(row.get("name") or "").strip())
+
+
+def _is_image(row: Any) -> bool:
+    """Return whether a row has a file name, and id and size as whole numbers."""
+    if not isinstance(row, dict) or not row.get("file_name"):
+        return False
+    return _are_whole(row, "id", "width", "height")
+
+
+def _are_whole(row: Row, *keys: str) -> bool:
     return all(isinstance(row.get(key), int | float) and row[key] == int(row[key]) for key in keys)

@@ -219,6 +219,9 @@ def join_parts(parts: Sequence[Any], height: int, width: int) -> Any:
 def _find_files(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
     """Return files of these suffixes below a folder, sorted, without hidden ones."""
     found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
-    return sorted(
-        path for path in found if not any(p.startswith(".") for p in path.relative_to(root).parts)
-    )
+    return sorted(path for path in found if not _is_hidden(path.relative_to(root)))
+
+
+def _is_hidden(path: Path) -> bool:
+    """Return whether the file, or a folder on the way to it, is hidden."""
+    return any(part.startswith(".") for part in path.parts)

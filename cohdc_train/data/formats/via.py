@@ -103,12 +103,8 @@ def _class_attribute(
     root: Path, entries: Sequence[Row], attribute: str | None, names: Path | None
 ) -> tuple[str, str | None]:
     """Return the attribute that holds the class; or "" and the class of all regions."""
-    found = {
-        name
-        for entry in entries
-        for region in _regions(entry)
-        for name in region["region_attributes"]
-    }
+    regions = [region for entry in entries for region in _regions(entry)]
+    found = {name for region in regions for name in region["region_attributes"]}
     candidates = ", ".join(sorted(found))
     if names is not None and attribute is None:
         lines = [text for _, text in read_lines(names)]

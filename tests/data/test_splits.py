@@ -1,4 +1,4 @@
-"""The source's own split: kept by the names of folders and lists, and test is never trained on."""
+"""Own split of a source: kept by the names of folders and lists, without test images."""
 
 import json
 import tempfile
@@ -25,14 +25,14 @@ FOLDERS = st.sampled_from([*NAMED, *MORE])
 
 
 def build(format: str, root: Path, folders: dict[str, int]) -> Path:
-    """A number of images in each folder, numbered on, with labelme's JSON files or VIA's."""
+    """Write images into folders, numbered through, with labelme's JSON files or VIA's."""
     seed = 0
     for folder, count in folders.items():
         entries = {}
         for _ in range(count):
             seed += 1
             name = f"{seed}.png"
-            toys.picture(root / folder / name, seed)
+            toys.draw_image(root / folder / name, seed)
             if format == "labelme":
                 shape = toys.shape("person", "polygon", toys.PERSON)
                 toys.labelme_file(root / folder / f"{seed}.json", [shape])
@@ -65,7 +65,7 @@ def test_own_split_is_kept_and_test_images_are_skipped(
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(["labelme", "via"]), st.dictionaries(FOLDERS, st.integers(1, 2), min_size=1))
 def test_every_test_image_is_skipped_and_counted(format: Any, folders: dict[str, int]) -> None:
-    """Whatever the mixture of folders."""
+    """It holds for any mixture of folders."""
     owners: dict[int, str] = {}
     for folder, count in folders.items():
         parts = [NAMED.get(part.lower(), "") for part in folder.split("/")]
@@ -122,7 +122,7 @@ def test_test_images_alone_are_converted_only_on_request(tmp_path: Path, format:
 def test_labelme_files_in_another_folder_follow_split_of_images(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for i, split in enumerate(("train", "train", "val", "test")):
-        toys.picture(root / split / f"{i}.png", i)
+        toys.draw_image(root / split / f"{i}.png", i)
         shape = toys.shape("person", "polygon", toys.PERSON)
         toys.labelme_file(root / "labels" / f"{i}.json", [shape], f"../{split}/{i}.png")
     assert stems(converted("labelme", root)) == {"train": [0, 1], "val": [2]}
@@ -167,7 +167,7 @@ def test_voc_counts_the_images_of_its_test_list(tmp_path: Path, capsys: Captured
 
 
 def test_voc_split_is_never_drawn_from_test_list(tmp_path: Path, capsys: Captured) -> None:
-    """As CVAT writes its lists, with a capital letter."""
+    """CVAT writes its lists with a capital letter."""
     root = toys.voc(tmp_path / "source")
     lists = root / "ImageSets" / "Segmentation"
     for name in ("train", "val"):

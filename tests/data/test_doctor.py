@@ -1,6 +1,4 @@
-"""The doctor on folders that are broken on purpose: it names each, training agrees with it, and the
-mend holds.
-"""
+"""Doctor on broken folders: it finds the issue, agrees with training, and fixes it."""
 
 import json
 import re
@@ -42,7 +40,7 @@ READABLE_ERRORS = {"leak", "box-corners"}
 
 
 def issues(root: Path, *options: str) -> tuple[int, dict[str, dict[str, list[str]]]]:
-    """Exit code, and kind -> places of both splits."""
+    """Run the doctor, and return the exit code and kind -> places of both splits."""
     code = main(["data", "doctor", str(root), "--out", str(root / "seen"), *options])
     return code, json.loads((root / "seen" / "issues.json").read_text())
 
@@ -59,7 +57,7 @@ COUNTED = {
 
 
 def train_once(paths: dict[str, Any]) -> int:
-    """A step on every batch of a training; returns the number of objects in them."""
+    """Take a training step on every batch, and return the number of objects in them."""
     data = CocoDataModule(canvas=(32, 48), batch_size=2, workers=0, **paths)
     data.setup("fit")
     torch.manual_seed(0)
@@ -106,7 +104,7 @@ def test_issue_is_found_agrees_with_training_and_is_fixed(
     case = broken_folders.BROKEN[name]
     root = broken_folders.build(tmp_path / "a", name)
     before = (root / "instances_train.json").read_bytes()
-    code, found = issues(root, "--fix", str(tmp_path / "mended"))
+    code, found = issues(root, "--fix", str(tmp_path / "fixed"))
     assert case.kind in found["train"]
     errors = {kind for kind in found["train"] if ISSUE_KINDS[kind].severity == "error"}
     assert code == (1 if errors else 0)
@@ -127,13 +125,11 @@ def test_issue_is_found_agrees_with_training_and_is_fixed(
             )
         assert train_once({"root": root}) > 5
     if case.fixed:
-        assert_fixed_folder_trains(tmp_path / "mended", root)
+        assert_fixed_folder_trains(tmp_path / "fixed", root)
 
 
 def assert_fixed_folder_trains(folder: Path, root: Path) -> None:
-    """The mended files train without a loss, hold no error, and with the removed rows all that
-    there was.
-    """
+    """Assert that the fixed files train without a loss or an error, and lack only removed rows."""
     images = root / "images"
     files = {name: folder / f"instances_{name}.json" for name in ("train", "val")}
     paths = CocoPaths(files["train"], images, files["val"], images)

@@ -1,4 +1,4 @@
-"""Training samples: what copy-paste does to pixels, masks and boxes, and mini-masks."""
+"""Training samples: effect of copy-paste on pixels, masks and boxes, and mini-masks."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def image(
     objects: list[CocoObject],
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ):
-    """A gray image with its objects' boxes in its own color."""
+    """Write a gray image with its objects' boxes in its own color."""
     pixels = np.full((*size, 3), 20, dtype=np.uint8)
     for o in objects:
         x, y, w, h = (int(v) for v in o.box)
@@ -43,8 +43,9 @@ def image(
 
 @pytest.fixture
 def two(tmp_path: Path) -> list[CocoImage]:
-    """One image with a large object (label 1), one with a smaller (label 2) that would lie over its
-    middle.
+    """Return an image with a large object (label 1), and one with a smaller (label 2).
+
+    The smaller would lie over the middle of the large one.
     """
     behind = image(tmp_path, 1, 100, [rectangle(1, 1, (10, 10, 60, 40))])
     before = image(tmp_path, 2, 200, [rectangle(2, 2, (30, 20, 20, 20))])
@@ -76,7 +77,7 @@ def test_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
 
 
 def test_nearly_hidden_object_is_ignored(tmp_path: Path) -> None:
-    """Its rest (4 of 64 rows' worth) is neither an object nor background."""
+    """Its visible rest (4 of 64 rows) is neither an object nor background."""
     small = image(tmp_path, 1, 100, [rectangle(1, 1, (30, 20, 21, 20))])
     large = image(tmp_path, 2, 200, [rectangle(2, 2, (20, 10, 30, 40))])
     pasted = [t for _, t in samples([small, large], PASTING) if t["labels"].tolist() == [2]]

@@ -1,4 +1,4 @@
-"""VGG Image Annotator: versions, shapes, where the class is, and every mistake named."""
+"""VGG Image Annotator: versions, shapes, class attributes, and named errors."""
 
 import json
 from pathlib import Path
@@ -49,7 +49,7 @@ def test_via_reads_every_version_and_shape(
             "_via_attributes": {"region": {}},
         }
     toys.write(root / "via.json", content)
-    toys.picture(root / "new.png", 30)
+    toys.draw_image(root / "new.png", 30)
     splits = converted("via", root)
     found = masks_of(splits, "a")
     assert [name for name, _ in found] == ["person", "car", "person", "person", "person", "person"]
@@ -88,7 +88,7 @@ def test_via_without_attributes_takes_class_of_names_file(tmp_path: Path) -> Non
     root = tmp_path / "source"
     content = {}
     for seed in range(3):
-        toys.picture(root / f"{seed}.png", seed)
+        toys.draw_image(root / f"{seed}.png", seed)
         regions = {"0": toys.region("circle", {}, cx=32, cy=24, r=12)}
         content[f"{seed}"] = {"filename": f"{seed}.png", "regions": regions}
     path = toys.write(root / "via_region_data.json", content)

@@ -1,6 +1,4 @@
-"""labelme: every shape with an inside, images inside the JSON or turned by EXIF, and every mistake
-named.
-"""
+"""labelme: shapes, images inside the JSON or turned by EXIF, and named errors."""
 
 import base64
 from pathlib import Path
@@ -99,15 +97,15 @@ def test_labelme_image_is_found_inside_json_or_in_other_folder(tmp_path: Path) -
 def test_images_turned_by_exif_are_written_as_annotated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Orientation 6 shows the right column first; the file's width is the picture's height."""
+    """Orientation 6 shows the right column first; the file's width is the image's height."""
     root = toys.labelme(tmp_path / "source")
     shapes = [toys.shape("person", "polygon", toys.PERSON)]
-    toys.picture(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)
+    toys.draw_image(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)
     toys.labelme_file(root / "turned.json", shapes, "turned.jpg")
-    toys.picture(root / "plain.jpg", 21, exif=8)
+    toys.draw_image(root / "plain.jpg", 21, exif=8)
     toys.labelme_file(root / "plain.json", shapes, "plain.jpg")
     data = (
-        toys.picture(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
+        toys.draw_image(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
     ).read_bytes()
     toys.labelme_file(root / "inside.json", shapes, "no.jpg", imageData=embedded(data))
     splits = converted("labelme", root)
@@ -120,7 +118,7 @@ def test_images_turned_by_exif_are_written_as_annotated(
     assert image_of(splits, "plain").path.samefile(
         root / "plain.jpg"
     )  # annotated on the unturned pixels
-    assert "       2  image turned as its EXIF says, and written anew: " in capsys.readouterr().out
+    assert "       2  image turned as its EXIF says, and written again: " in capsys.readouterr().out
     assert main(["data", "doctor", str(tmp_path / "source_coco")]) == 0
 
 

@@ -1,6 +1,4 @@
-"""Every foreign format becomes a folder that training reads: the same masks, nothing lost unsaid,
-or nothing at all.
-"""
+"""Conversion of other formats: exact masks, counted losses, and all or nothing."""
 
 import json
 import os
@@ -76,7 +74,7 @@ def test_convert_prints_counts_and_next_command(
     root = toys.labelme(tmp_path / "source")
     line = toys.shape("person", "linestrip", [1, 1, 9, 9, 20, 4])
     toys.labelme_file(root / "a.json", [toys.shape("person", "polygon", toys.PERSON), line])
-    toys.picture(root / "new.jpg", 9)
+    toys.draw_image(root / "new.jpg", 9)
     out = tmp_path / "out"
     assert (
         main(["data", "convert", "labelme", str(root), str(out), "--val", "0.5", "--seed", "3"])
@@ -99,7 +97,7 @@ def test_convert_prints_counts_and_next_command(
 def test_drawn_split_repeats_for_same_seed(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for seed in range(10):
-        toys.picture(root / f"{seed}.png", seed)
+        toys.draw_image(root / f"{seed}.png", seed)
         toys.labelme_file(root / f"{seed}.json", [toys.shape("person", "polygon", toys.PERSON)])
     runs = []
     for i, (val, seed) in enumerate([(0.2, 0), (0.2, 0), (0.2, 1), (0.001, 0), (0.999, 0)]):
@@ -144,9 +142,9 @@ def test_image_folders_that_would_be_misread_are_refused(tmp_path: Path) -> None
         tmp_path / "source", "train: images\nval: images/train/train\nnames: [person, car]\n"
     )
     for split in ("train/train", "train"):
-        toys.picture(root / "images" / split / "a.png", 1)
+        toys.draw_image(root / "images" / split / "a.png", 1)
         toys.write(root / "labels" / split / "a.txt", toys.yolo_row(0, toys.PERSON))
-    toys.picture(root / "images" / "train" / "train" / "train" / "a.png", 1)
+    toys.draw_image(root / "images" / "train" / "train" / "train" / "a.png", 1)
     with pytest.raises(DataError, match="images/train would be taken for others of the same name"):
         convert("yolo", root, tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
@@ -215,7 +213,7 @@ JUNK = st.sampled_from(
 
 
 def places(value: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The ways to every value inside of a JSON value."""
+    """Yield the path to every value inside a JSON value."""
     pairs = (
         value.items()
         if isinstance(value, dict)
@@ -284,5 +282,5 @@ def test_conversion_error_names_file_for_every_format(
 
 
 def seed_drawing_d(root: Path) -> int:
-    """A seed for which d.png, the fourth of four, is the validation image."""
+    """Return a seed for which d.png, the fourth of four, is the validation image."""
     return next(seed for seed in range(99) if np.random.default_rng(seed).permutation(4)[0] == 3)

@@ -1,6 +1,4 @@
-"""`cohdc data tum` against a host of its own: download, resumption, checks, and archives that must
-not be unpacked.
-"""
+"""`cohdc data tum` against a local host: download, resumption, checks, unsafe archives."""
 
 import hashlib
 import io
@@ -41,7 +39,7 @@ def archive(files: dict[str, bytes], *extra: tarfile.TarInfo) -> bytes:
 
 
 class Host(BaseHTTPRequestHandler):
-    """Gives one file, from a byte on when asked to; breaks off behind `breaks` bytes."""
+    """Serves one file, from a byte on when asked to, and stops after `breaks` bytes."""
 
     content = b""
     breaks: ClassVar[int | None] = None

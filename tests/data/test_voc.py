@@ -1,4 +1,4 @@
-"""Pascal VOC segmentation: majorities, void, colors, names, and every mistake named."""
+"""Pascal VOC segmentation: majorities, void, colors, names, and named errors."""
 
 from pathlib import Path
 
@@ -36,12 +36,17 @@ def test_voc_class_is_majority_and_void_is_background(
     )
 
 
-LABELMAP = "# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:10,20,30::\nperson:200,10,0:head,foot:run\n"
+LABELMAP = """\
+# label:color_rgb:parts:actions
+background:0,0,0::
+car:10,20,30::
+person:200,10,0:head,foot:run
+"""
 
 
 @pytest.mark.parametrize("palette", [True, False])
 def test_voc_reads_colors_of_labelmap(tmp_path: Path, palette: bool) -> None:
-    """As CVAT writes it: no split, PNGs of colors, images of any type in sub folders."""
+    """CVAT writes no split, PNGs of colors, and images of any type in subfolders."""
     root = tmp_path / "source"
     objects, classes = toys.voc_labels()
     paints = {
@@ -53,7 +58,7 @@ def test_voc_reads_colors_of_labelmap(tmp_path: Path, palette: bool) -> None:
         2: (0, 128, 0),
     }
     for seed, name in enumerate(("day/a", "night/b", "night/c")):
-        toys.picture(root / "JPEGImages" / f"{name}.png", seed)
+        toys.draw_image(root / "JPEGImages" / f"{name}.png", seed)
         for folder, values in (("SegmentationObject", objects), ("SegmentationClass", classes)):
             rgb = np.zeros((*values.shape, 3), np.uint8)
             for value, color in paints.items():
@@ -105,7 +110,7 @@ VOC_ERRORS = {
     r"SegmentationObject/a\.png: a PNG of mode I;16; a palette": lambda r: Image.fromarray(
         np.ones((toys.HEIGHT, toys.WIDTH), np.uint16)
     ).save(r / "SegmentationObject" / "a.png"),
-    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.picture(
+    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.draw_image(
         r / "JPEGImages" / "a.jpg", 1, (10, 10)
     ),
     r"labelmap\.txt:2: not name:R,G,B$": lambda r: toys.write(

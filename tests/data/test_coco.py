@@ -1,4 +1,4 @@
-"""Every layout and format that the loader takes, and every mistake it names."""
+"""Layouts and segmentations that the COCO loader reads, and the errors it names."""
 
 import copy
 import json
@@ -29,7 +29,7 @@ PERSON, CAR = 1, 2  # labels: categories are sorted by id, 10 and 20
 
 
 def split_of(tmp_path: Path, change: Any = None, classes: list[str] | None = None) -> CocoSplit:
-    """Three drawn images, their annotations changed by a function."""
+    """Write three drawn images whose annotations a function has changed."""
     value = toys.content(tmp_path / "images", "train", 3)
     value = copy.deepcopy(value)
     if change is not None:

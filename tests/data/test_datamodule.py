@@ -1,4 +1,4 @@
-"""Batches: shapes, types, ranges, and the same ones for the same seed."""
+"""Batches: shapes, types, ranges, and repeatability for a seed."""
 
 import json
 import subprocess
@@ -152,7 +152,8 @@ data = CocoDataModule(sys.argv[1], canvas=(256, 384), batch_size=1, workers=0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 torch.manual_seed(0)
 batch = next(iter(data.train_dataloader()))
-network = MaskRCNN(2, NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384)))
+config = NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384))
+network = MaskRCNN(2, config)
 losses = network.losses(batch.images.float() / 255, batch.targets)
 sum(losses.values()).backward()
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -182,16 +183,16 @@ def test_hundreds_of_objects_on_a_large_image_take_little_memory(tmp_path: Path)
 
 
 def test_paste_roots_are_pasted_and_not_trained_on(tmp_path: Path) -> None:
-    pictures, others = toys.folder(tmp_path / "a", train=2), toys.folder(tmp_path / "b", train=5)
+    root, others = toys.folder(tmp_path / "a", train=2), toys.folder(tmp_path / "b", train=5)
     augment = Augmentation(copy_paste=1.0, scale_jitter=(1.0, 1.0))
-    data = module(pictures, paste_roots=[others], augment=augment)
+    data = module(root, paste_roots=[others], augment=augment)
     assert len(data.paste_sources) == 2
     (batch,) = list(data.train_dataloader())
     assert sorted(target["image_id"] for target in batch.targets) == [1, 2]
     with pytest.raises(DataError, match="pasted nowhere"):
-        module(pictures, paste_roots=[others])
+        module(root, paste_roots=[others])
     rows = json.loads((others / "instances_train.json").read_text())
     rows["categories"][0]["name"] = "lorry"
     toys.write(others / "instances_train.json", rows)
     with pytest.raises(DataError, match="lorry"):
-        _ = module(pictures, paste_roots=[others], augment=augment).paste_sources
+        _ = module(root, paste_roots=[others], augment=augment).paste_sources
