@@ -48,7 +48,7 @@ def test_folders_are_whole_or_absent(tmp_path: Path) -> None:
 
 
 def fill(folder: Path, **contents: str) -> Path:
-    """Write a folder with files; `sub__name` is one in a folder below it."""
+    """Make a folder with files; `sub__name` is one in a folder below it."""
     for name, content in contents.items():
         file = folder / name.replace("__", "/")
         file.parent.mkdir(parents=True, exist_ok=True)
