@@ -18,7 +18,7 @@ class BlindSegmenter:
 
     class_names = ("car", "tree")
 
-    def __init__(self, model: Path, threads: int = 0) -> None:
+    def __init__(self, model: Path, num_threads: int = 0) -> None:
         """Take any file."""
 
     def __call__(self, rgb: np.ndarray) -> Detections:
