@@ -23,7 +23,7 @@ class LoopCloserLike(Protocol):
     closed: int
 
     @property
-    def ends(self) -> set[int]:
+    def loop_keyframes(self) -> set[int]:
         """Indices of the keyframes that loops refer to."""
 
     def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
@@ -122,7 +122,7 @@ class LocalMapper:
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
         if self._loops is not None:
             self._loops.close(keyframe, picture())
-            in_use = in_use | self._loops.ends
+            in_use = in_use | self._loops.loop_keyframes
         if self._culls_keyframes:
             for removed in cull_keyframes(self._world, keyframe, in_use):
                 if self._loops is not None:

@@ -18,7 +18,9 @@ _MIN_FOUND = 0.25
 def add_points(world: Map, keyframe: Keyframe) -> None:
     """A point for every corner with depth that belongs to none."""
     features = keyframe.features
-    usable = (keyframe.point_ids < 0) & (features.depths <= world.camera.far)  # nan compares False
+    usable = (keyframe.point_ids < 0) & (
+        features.depths <= world.camera.max_depth_m
+    )  # nan compares False
     world.add_points(keyframe, np.flatnonzero(usable))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.motion_segmentation import pose_of_rest
+from cohdc_train.slam.dynamics.motion_segmentation import estimate_static_pose
 from cohdc_train.slam.features.descriptors import thumbnail
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
@@ -163,7 +163,7 @@ class Localizer:
         points, seen = self.map.measured(fit.matches, features)
         if self._judges:
             known = self.map.found[ids]
-            T_cw, inlier, moving = pose_of_rest(
+            T_cw, inlier, moving = estimate_static_pose(
                 fit.T_cw, points, seen, self._reprojection, known, fit.prior
             )
         else:

@@ -290,7 +290,7 @@ class Tracker:
         if not self.method.geometry or self._last is None or expected is None:
             return frame.mask
         around = self.map.covisible(self._last.matches.points, LOCAL_KEYFRAMES)
-        return self._dynamic_mask.of(
+        return self._dynamic_mask.estimate(
             frame.mask, frame.depth_m, expected.prior.T_cw, around, frame.t
         )
 
@@ -351,7 +351,7 @@ class Tracker:
         features, mask = self.features, self.mask
         point_ids = np.full(len(features), -1)
         point_ids[fit.matches.keypoints] = fit.matches.points
-        pictures = thumbnail(frame.rgb), self._geometry.nearest(frame.depth_m)
+        pictures = thumbnail(frame.rgb), self._geometry.min_depth_grid(frame.depth_m)
         keyframe = Keyframe(self.map.joined, frame.t, fit.T_cw, features, point_ids, *pictures)
         self._mapping.insert(
             keyframe, lambda: make_depth_image(frame.rgb, frame.depth_m, mask, self.camera)
@@ -367,7 +367,7 @@ class Tracker:
         if fit is None or fit.reference is None:
             self._last = None
             self._motion.forget()
-            self._dynamic_mask.forget()
+            self._dynamic_mask.reset()
             return
         self._last = fit
         self._since_keyframe += 1
