@@ -14,17 +14,22 @@ from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, n
 from cohdc_train.slam.frame import PoseCallback
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.growing_sequence import Followed
-from cohdc_train.slam.io.live import stopped_by_ctrl_c
-from cohdc_train.slam.io.results import check_out, measure, publish_run, write_run
-from cohdc_train.slam.io.sources import Recorded, Source, rgbd_layout
-from cohdc_train.slam.io.stereo import stereo_layout
+from cohdc_train.slam.io.growing_sequence import GrowingSequence
+from cohdc_train.slam.io.live import stop_on_sigint
+from cohdc_train.slam.io.results import (
+    check_output_dir,
+    compute_metrics,
+    move_into_place,
+    write_run,
+)
+from cohdc_train.slam.io.sources import FrameSource, RecordedSequence, rgbd_format
+from cohdc_train.slam.io.stereo import stereo_format
 from cohdc_train.slam.runner import RunObserver, play
-from cohdc_train.slam.runtime.threads import one_thread
-from cohdc_train.slam.runtime.workers import workers
+from cohdc_train.slam.runtime.threads import single_threaded
+from cohdc_train.slam.runtime.workers import start_workers
 from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
 from cohdc_train.slam.visualization.map_files import MapFiles
-from cohdc_train.slam.visualization.rerun_viewer import Viewer
+from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 
@@ -96,7 +101,7 @@ def slam(
 
 
 def run_source(
-    source: Source,
+    source: FrameSource,
     *,
     out: Path,
     model: Path | None = None,
@@ -114,7 +119,7 @@ def run_source(
     origin: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """`slam` of any source of views, a camera of one's own for instance; the same files, metrics
-    and errors. One run at a time in a process (`one_thread`).
+    and errors. One run at a time in a process (`single_threaded`).
 
     on_pose: called with every frame's pose as soon as it is known; watchers: when what the frame
     adds to the map has been done as well, in real time up to a frame's time later; origin: words
@@ -141,23 +146,23 @@ def run_source(
     }
     config |= {**(origin or {}), "version": __version__}
     with (
-        one_thread(),
+        single_threaded(),
         tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder,
     ):
         part = Path(folder)
         with ExitStack() as stack:
-            beside = stack.enter_context(workers(source, maker)) if realtime else None
-            in_time = (beside.executor, beside.source.spent) if beside else ()
+            workers = stack.enter_context(start_workers(source, maker)) if realtime else None
+            in_time = (workers.executor, workers.source.frame_time_used) if workers else ()
             tracker = Tracker(source.camera, features, seed, method, *in_time)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
             observers = [files, *observers]
             if view or rrd is not None:
-                observers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
-            stack.enter_context(stopped_by_ctrl_c(source))
+                observers.append(stack.enter_context(RerunViewer(source.camera, view, rrd)))
+            stack.enter_context(stop_on_sigint(source))
             views, mask_of = (
-                (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
+                (workers.source, workers.mask_of) if workers else (source, maker or no_masks)
             )
-            answer = beside.answering(on_pose) if beside else on_pose
+            answer = workers.report_latency(on_pose) if workers else on_pose
             records = play(tracker, views, mask_of, part / "pictures", observers, answer)
             files.write(tracker)
         trajectory = Trajectory(*tracker.trajectory())
@@ -165,13 +170,15 @@ def run_source(
             "seed": seed,
             "realtime": realtime,
             "loops": tracker.loops,
-            "without_depth": source.without_depth,
+            "without_depth": source.num_unpaired,
         }
         metrics["keyframes_in_map"] = len(tracker.map.keyframes)
-        metrics |= measure(records, trajectory, truth, beside.source.dropped if beside else 0)
-        metrics |= beside.metrics() if beside else {}
+        metrics |= compute_metrics(
+            records, trajectory, truth, workers.source.dropped if workers else 0
+        )
+        metrics |= workers.metrics() if workers else {}
         write_run(part, records, trajectory, metrics, config)
-        publish_run(part, out)
+        move_into_place(part, out)
     print(f"{summary(metrics)}\nwritten to {out}")
     return metrics
 
@@ -222,12 +229,12 @@ def _check_options(
         raise DataError(f"seed is {seed}; it cannot be below 0")
     if features < MIN_START:
         raise DataError(f"features is {features}; a map cannot start with fewer than {MIN_START}")
-    check_out(out, cloud)
+    check_output_dir(out, cloud)
 
 
 def _source(
     sequence: Path, camera: Path | None, follow: bool, idle: float
-) -> tuple[Source, dict[str, str]]:
+) -> tuple[FrameSource, dict[str, str]]:
     """The frames of a folder, and what config.yaml says of where they come from."""
     if not sequence.is_dir():
         raise DataError(f"{sequence}: no such folder")
@@ -237,15 +244,15 @@ def _source(
     stereo = (sequence / "left.txt").is_file() or (
         intrinsics.baseline > 0 and not (sequence / "rgb.txt").is_file()
     )
-    layout = stereo_layout(intrinsics) if stereo else rgbd_layout(intrinsics)
+    layout = stereo_format(intrinsics) if stereo else rgbd_format(intrinsics)
     if follow:
         print(
             f"sequence: {layout.first} and {layout.second} as they grow; a file {sequence / 'done'} or Ctrl-C ends it"
         )
-        return Followed(sequence, intrinsics, layout, idle), words
-    source = Recorded(sequence, intrinsics, layout)
+        return GrowingSequence(sequence, intrinsics, layout, idle), words
+    source = RecordedSequence(sequence, intrinsics, layout)
     print(
-        f"sequence: {len(source)} pairs; {source.without_depth} images have no partner and are left out"
+        f"sequence: {len(source)} pairs; {source.num_unpaired} images have no partner and are left out"
     )
     return source, words
 

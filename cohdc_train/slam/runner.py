@@ -15,7 +15,7 @@ from cohdc_train.slam.dynamics.mask_sources import MaskSource
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameRecord, PoseCallback, View
-from cohdc_train.slam.io.sources import Source
+from cohdc_train.slam.io.sources import FrameSource
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.overlays import draw_after, draw_before, write_jpeg
 
@@ -46,7 +46,7 @@ class _Picture:
 
 def play(
     tracker: Tracker,
-    source: Source,
+    source: FrameSource,
     mask_of: MaskSource,
     pictures: Path,
     observers: Sequence[RunObserver],

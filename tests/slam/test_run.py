@@ -21,7 +21,7 @@ from cohdc_train.slam.config import Culling, Method
 from cohdc_train.slam.dynamics.mask_sources import SegmenterMasks
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.io.sources import Recorded
+from cohdc_train.slam.io.sources import RecordedSequence
 from cohdc_train.slam.run import run_source, slam
 from cohdc_train.trajectory.trajectory import read_tum
 
@@ -311,7 +311,7 @@ def test_a_doubtful_contour_grows_more_unless_its_cut_has_seen_to_that(
     )
     masks = SegmenterMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
     assert masks(view)[120].sum() == 160 + px
-    assert masks.outline(view)[1] == px
+    assert masks.segment(view)[1] == px
 
 
 def threads() -> set[int]:
@@ -322,7 +322,7 @@ def threads() -> set[int]:
 def test_linear_algebra_has_one_thread_while_it_runs(sequence: Path, tmp_path: Path) -> None:
     seen = set()
     with threadpool_limits(2, "blas"):
-        source = Recorded(sequence, choose_camera(sequence, None)[0])
+        source = RecordedSequence(sequence, choose_camera(sequence, None)[0])
         run_source(
             source, out=tmp_path / "out", features=300, on_pose=lambda pose: seen.update(threads())
         )

@@ -27,9 +27,9 @@ from cohdc_train.files import write_json, write_text
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.slam.config import Culling
-from cohdc_train.slam.dynamics.mask_sources import dynamic_mask, dynamic_objects, growth
+from cohdc_train.slam.dynamics.mask_sources import dilation_for, dynamic_mask, select_dynamic
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.io.sources import Recorded, rgbd_layout
+from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
 from cohdc_train.slam.io.tum import read_mask
 from cohdc_train.slam.run import slam
 
@@ -45,7 +45,7 @@ def main() -> None:
     rows: list[Row] = []
     for sequence in arguments.sequences:
         camera, _ = choose_camera(sequence, None)
-        source = Recorded(sequence, camera, rgbd_layout(camera))
+        source = RecordedSequence(sequence, camera, rgbd_format(camera))
         found = {view.name: segmenter(view.rgb) for view in source}
         truth = {name: read_mask(sequence / "masks" / f"{name}.png", camera) for name in found}
         for way, culling in ways(found.values(), labels).items():
@@ -87,8 +87,8 @@ def parse() -> argparse.Namespace:
 
 def ways(found: Iterable[Detections], labels: frozenset[int]) -> dict[str, Culling]:
     """What is compared, on the detections of a sequence."""
-    qualities = [q for one in found for q in dynamic_objects(one, labels, BY_QUALITY).quality]
-    alike = round(growth(BY_QUALITY, float(np.mean(qualities or [1.0]))))
+    qualities = [q for one in found for q in select_dynamic(one, labels, BY_QUALITY).quality]
+    alike = round(dilation_for(BY_QUALITY, float(np.mean(qualities or [1.0]))))
     return {
         "by quality": BY_QUALITY,
         "alike": replace(BY_QUALITY, doubt=0.0, dilate=alike),

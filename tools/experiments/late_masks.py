@@ -23,34 +23,38 @@ from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.slam.config import Culling, Method
-from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
+from cohdc_train.slam.dynamics.mask_propagation import (
+    PropagatedMask,
+    SegmentationJob,
+    downsample_mask,
+)
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.io.sources import Recorded, rgbd_layout
-from cohdc_train.slam.runtime.async_masks import Outline
+from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
+from cohdc_train.slam.runtime.async_masks import SegmentFunction
 from cohdc_train.slam.runtime.executors import SynchronousExecutor
-from cohdc_train.slam.runtime.threads import one_thread
+from cohdc_train.slam.runtime.threads import single_threaded
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 
 class LateMasks:
-    """Masks as `AsyncMasks` makes them, of a segmenter that takes `late` frames; the first is
+    """Masks as `AsyncSegmenter` makes them, of a segmenter that takes `late` frames; the first is
     waited for.
     """
 
-    def __init__(self, outline: Outline, late: int) -> None:
-        self._outline, self._late = outline, late
-        self._carried = CarriedMasks()
-        self._at_work: Job | None = None
+    def __init__(self, segment: SegmentFunction, late: int) -> None:
+        self._segment, self._late = segment, late
+        self._carried = PropagatedMask()
+        self._at_work: SegmentationJob | None = None
 
     def __call__(self, view: View) -> Mask:
         """[H, W] bool, True = dynamic."""
         if self._late == 0:
-            return grow(*self._outline(view))
+            return dilate_mask(*self._segment(view))
         job = self._carried.advance(view)
         if self._at_work is not None and job.number >= self._at_work.number + self._late:
             self._done(self._at_work)
@@ -60,38 +64,40 @@ class LateMasks:
             self._at_work = job
         return self._carried.mask(view)
 
-    def _done(self, job: Job) -> None:
-        mask, growth = self._outline(job.view)
-        self._carried.renew(job, halve_mask(mask), growth)
+    def _done(self, job: SegmentationJob) -> None:
+        mask, growth = self._segment(job.view)
+        self._carried.update(job, downsample_mask(mask), growth)
         self._at_work = None
 
 
-def remembered(outline: Outline) -> Outline:
+def remembered(segment: SegmentFunction) -> SegmentFunction:
     """The same, asked once for every frame."""
     known: dict[str, tuple[Mask, float]] = {}
 
     def ask(view: View) -> tuple[Mask, float]:
         if view.name not in known:
-            known[view.name] = outline(view)
+            known[view.name] = segment(view)
         return known[view.name]
 
     return ask
 
 
-def opened(folder: Path, model: Path | None) -> tuple[Recorded, Outline]:
+def opened(folder: Path, model: Path | None) -> tuple[RecordedSequence, SegmentFunction]:
     """A sequence, and what outlines its people. Raises DataError for what cannot be used."""
     camera = choose_camera(folder, None)[0]
-    source = Recorded(folder, camera, rgbd_layout(camera))
+    source = RecordedSequence(folder, camera, rgbd_format(camera))
     if source.groundtruth is None:
         raise DataError(f"{folder}: no groundtruth.txt to score by")
     if model is None:
-        return source, remembered(MaskFolder(folder / "masks", camera, Culling()).outline)
-    return source, remembered(SegmenterMasks(Segmenter(model), Culling()).outline)
+        return source, remembered(MaskFolder(folder / "masks", camera, Culling()).segment)
+    return source, remembered(SegmenterMasks(Segmenter(model), Culling()).segment)
 
 
-def error(source: Recorded, masks: Callable[[View], Mask], features: int, method: Method) -> float:
+def error(
+    source: RecordedSequence, masks: Callable[[View], Mask], features: int, method: Method
+) -> float:
     """ATE RMSE, m."""
-    with one_thread():
+    with single_threaded():
         tracker = Tracker(source.camera, features, 0, method, SynchronousExecutor())
         for view in source:
             tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
@@ -131,10 +137,10 @@ def run(arguments: argparse.Namespace) -> None:
         ["| sequence | late by frames | mean ATE RMSE, m | each |", "|---|---|---|---|"],
     )
     for folder in arguments.sequences:
-        source, outline = opened(folder, arguments.model)
+        source, segment = opened(folder, arguments.model)
         for late in arguments.late:
             errors = [
-                error(source, LateMasks(outline, late), n, arguments.method)
+                error(source, LateMasks(segment, late), n, arguments.method)
                 for n in arguments.features
             ]
             rows += [

@@ -26,7 +26,7 @@ from slam_method import add_method_option
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Recorded
+from cohdc_train.slam.io.sources import RecordedSequence
 from cohdc_train.slam.run import run_source
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.association import associate
@@ -63,9 +63,9 @@ class ForthAndBack:
 
     def __init__(self, folder: Path, frames: int, shrink: int, out: Path) -> None:
         camera, _ = choose_camera(folder, None)
-        recorded = Recorded(folder, camera)
+        recorded = RecordedSequence(folder, camera)
         self.camera = shrunk(camera, shrink)
-        self.without_depth = 0
+        self.num_unpaired = 0
         self._images, stamps = [], []
         for view in recorded:
             self._images.append(small(view, self.camera, shrink))
@@ -110,7 +110,7 @@ def shrunk(camera: Camera, by: int) -> Camera:
     c = camera
     cx, cy = (c.cx + 0.5) / by - 0.5, (c.cy + 0.5) / by - 0.5
     size = {"width": c.width // by, "height": c.height // by}
-    return replace(c, fx=c.fx / by, fy=c.fy / by, cx=cx, cy=cy, readout=0.0, **size)
+    return replace(c, fx=c.fx / by, fy=c.fy / by, cx=cx, cy=cy, readout_s=0.0, **size)
 
 
 def small(view: View, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:

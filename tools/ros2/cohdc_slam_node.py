@@ -36,8 +36,15 @@ from sensor_msgs.msg import CameraInfo, Image
 from cohdc_train.slam.config import MAX_KEYPOINTS
 from cohdc_train.slam.frame import FrameRecord, Pose, View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.live import Frame, Live
-from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
+from cohdc_train.slam.io.live import Frame, LiveCamera
+from cohdc_train.slam.io.ros import (
+    camera_from_message,
+    depth_from_message,
+    fill_mask,
+    fill_pose,
+    rgb_from_message,
+    to_seconds,
+)
 from cohdc_train.slam.run import run_source
 from cohdc_train.slam.tracking.tracker import Tracker
 
@@ -88,7 +95,7 @@ class SlamNode(Node):
         """The camera, as soon as it is told."""
         while True:
             try:
-                return camera_of(self._infos.get(timeout=WAIT))
+                return camera_from_message(self._infos.get(timeout=WAIT))
             except queue.Empty:
                 continue
 
@@ -100,9 +107,9 @@ class SlamNode(Node):
             except queue.Empty:
                 yield None
                 continue
-            t = seconds(color.header.stamp)
+            t = to_seconds(color.header.stamp)
             self._headers[t] = color.header
-            yield rgb_of(color), depth_of(depth), t
+            yield rgb_from_message(color), depth_from_message(depth), t
 
     def _take(self, color: Any, depth: Any) -> None:
         while True:
@@ -152,7 +159,10 @@ def main() -> None:
     try:
         options = node.options()
         run_source(
-            Live(node.camera(), node.frames()), observers=[node], on_pose=node.on_pose, **options
+            LiveCamera(node.camera(), node.frames()),
+            observers=[node],
+            on_pose=node.on_pose,
+            **options,
         )
     finally:
         node.destroy_node()

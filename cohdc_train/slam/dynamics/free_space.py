@@ -37,7 +37,7 @@ _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceDepth:
     """What a keyframe saw. T_cw: [4, 4] world to camera, m; nearest: Coarse, the least depth around
     every pixel.
     """
@@ -55,17 +55,17 @@ class DepthComparison:
     """
 
     image: DepthGrid
-    through: NDArray[np.bool_]
-    agrees: NDArray[np.bool_]
+    violations: NDArray[np.bool_]
+    consistent: NDArray[np.bool_]
 
     def only(self, rows: list[int]) -> "DepthComparison":
         """The same with some of the references."""
-        return DepthComparison(self.image, self.through[rows], self.agrees[rows])
+        return DepthComparison(self.image, self.violations[rows], self.consistent[rows])
 
     @property
-    def still(self) -> NDArray[np.bool_]:
+    def static(self) -> NDArray[np.bool_]:
         """[h, w] bool: a reference saw a surface there and none looked through."""
-        return np.asarray(self.agrees.any(axis=0) & ~self.through.any(axis=0))
+        return np.asarray(self.consistent.any(axis=0) & ~self.violations.any(axis=0))
 
 
 class FreeSpaceChecker:
@@ -74,23 +74,23 @@ class FreeSpaceChecker:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self._shape = (camera.height // _STEP, camera.width // _STEP)
-        coarse = _STEP * _grid(*self._shape) + _CENTRE
-        self._rays = camera.backproject(coarse, np.ones(len(coarse))).T.astype(np.float32)
+        downsample = _STEP * _grid(*self._shape) + _CENTRE
+        self._rays = camera.backproject(downsample, np.ones(len(downsample))).T.astype(np.float32)
         to_coarse = np.diag([1 / _STEP, 1 / _STEP, 1.0])
         to_coarse[:2, 2] = -_CENTRE / _STEP
         self._matrix = to_coarse @ camera.matrix()
-        where = np.rint(camera.distort(coarse)).astype(np.int64).T
+        where = np.rint(camera.distort(downsample)).astype(np.int64).T
         self._column, self._row = (
             np.clip(p, 0, n - 1) for p, n in zip(where, (camera.width, camera.height), strict=True)
         )
-        self._measured = _maps((camera.distort(coarse) - _CENTRE) / _STEP, self._shape)
+        self._measured = _maps((camera.distort(downsample) - _CENTRE) / _STEP, self._shape)
         whole = (camera.height, camera.width)
         flat = cv2.convertMaps(
             *_maps(camera.undistort(_grid(*whole)), whole), cv2.CV_16SC2, nninterpolation=True
         )
         self._flat = flat[0]  # where each pixel would be without distortion, whole px
 
-    def nearest(self, depth: NDArray[np.float32]) -> DepthGrid:
+    def min_depth_grid(self, depth: NDArray[np.float32]) -> DepthGrid:
         """What a keyframe remembers of its depth image [H, W] m: the least around every coarse
         pixel.
         """
@@ -99,43 +99,47 @@ class FreeSpaceChecker:
         )
 
     def compare(
-        self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]
+        self, depth: NDArray[np.float32], T_cw: Array, references: list[ReferenceDepth]
     ) -> DepthComparison:
         """depth: [H, W] m, 0 = none; T_cw: [4, 4] the frame's expected pose."""
         image = self._coarse(depth)
         rows = np.flatnonzero(image)
         shape = (len(references), *self._shape)
-        through, agrees = (np.zeros((shape[0], image.size), dtype=np.bool_) for _ in range(2))
+        violations, consistent = (
+            np.zeros((shape[0], image.size), dtype=np.bool_) for _ in range(2)
+        )
         if references and len(rows):
-            seen, z = self._looked_up(
+            seen, z = self._lookup_depth(
                 self._rays[:, rows] * image.ravel()[rows], inverse(T_cw), references
             )
             tolerance = _NEARER + _NEARER_PER_M * z
-            through[:, rows] = (seen - z > tolerance) & (z > _NEAR)
-            agrees[:, rows] = (seen > 0) & (np.abs(seen - z) <= tolerance) & (z > _NEAR)
-        return DepthComparison(image, through.reshape(shape), agrees.reshape(shape))
+            violations[:, rows] = (seen - z > tolerance) & (z > _NEAR)
+            consistent[:, rows] = (seen > 0) & (np.abs(seen - z) <= tolerance) & (z > _NEAR)
+        return DepthComparison(image, violations.reshape(shape), consistent.reshape(shape))
 
-    def movers(self, comparison: DepthComparison) -> NDArray[np.bool_]:
+    def find_moving(self, comparison: DepthComparison) -> NDArray[np.bool_]:
         """Returns [h, w] bool, coarse: what two references looked through, and its surface around
         it.
         """
-        image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
+        image, votes = comparison.image, np.count_nonzero(comparison.violations, axis=0)
         return _grown(
-            votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image
+            votes >= min(_VOTES, max(len(comparison.violations) - 1, 1)), comparison.static, image
         )
 
-    def coarse(self, picture: NDArray[_Value]) -> NDArray[_Value]:
+    def downsample(self, picture: NDArray[_Value]) -> NDArray[_Value]:
         """picture: [H, W] as measured. Returns [h, w]: what it says in the middle of every coarse
         pixel.
         """
         return np.asarray(picture[self._row, self._column]).reshape(self._shape)
 
-    def fine(self, movers: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def upsample(self, find_moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """movers: [h, w] bool, coarse. Returns [H, W] bool, the same in the image as measured."""
-        if not movers.any():
+        if not find_moving.any():
             return np.zeros((self.camera.height, self.camera.width), dtype=np.bool_)
         size = (_STEP * self._shape[1], _STEP * self._shape[0])
-        smooth = cv2.resize(movers.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        smooth = cv2.resize(
+            find_moving.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR
+        )
         return np.asarray(cv2.remap(smooth, self._flat, np.empty(0), cv2.INTER_NEAREST) > 127)
 
     def static_components(
@@ -148,12 +152,16 @@ class FreeSpaceChecker:
         from rest.
         """
         count, parts = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
-        coarse = self.coarse(parts)
-        readings, still, moved = (
-            np.bincount(coarse[chosen], minlength=count)
-            for chosen in (comparison.image > 0, comparison.still, comparison.through.any(axis=0))
+        downsample = self.downsample(parts)
+        readings, static, moved = (
+            np.bincount(downsample[chosen], minlength=count)
+            for chosen in (
+                comparison.image > 0,
+                comparison.static,
+                comparison.violations.any(axis=0),
+            )
         )
-        rests = (still >= np.maximum(_JUDGED * readings, LEAST)) & (moved <= _MOVED * still)
+        rests = (static >= np.maximum(_JUDGED * readings, LEAST)) & (moved <= _MOVED * static)
         rests[0] = False
         return np.asarray(rests[parts]) if rests.any() else np.zeros_like(mask)
 
@@ -173,8 +181,8 @@ class FreeSpaceChecker:
         image = np.where((share >= 64) & (least < _FAR), least, 0.0).astype(np.float32)
         return np.asarray(cv2.remap(image, *self._measured, cv2.INTER_NEAREST), dtype=np.float32)
 
-    def _looked_up(
-        self, points: NDArray[np.float32], T_wc: Array, references: list[Reference]
+    def _lookup_depth(
+        self, points: NDArray[np.float32], T_wc: Array, references: list[ReferenceDepth]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """points: [3, n] in the frame T_wc, m. Returns [k, n] m: the depth each reference has
         there, and that of the points from it. float32: that is a hundredth of a coarse pixel, and
@@ -215,7 +223,7 @@ def _maps(places: Array, shape: tuple[int, int]) -> tuple[NDArray[np.float32], N
 
 
 def _grown(
-    found: NDArray[np.bool_], still: NDArray[np.bool_], image: DepthGrid
+    found: NDArray[np.bool_], static: NDArray[np.bool_], image: DepthGrid
 ) -> NDArray[np.bool_]:
     """Specks dropped; the rest grown over its own surface, as far as that is not known to stand
     still.
@@ -228,5 +236,5 @@ def _grown(
         beside = cv2.dilate(
             np.where(kept, image, 0.0).astype(np.float32), _CROSS
         )  # depth of the mover next to it
-        kept |= (beside > 0) & (image > 0) & ~still & (np.abs(beside - image) < JUMP)
+        kept |= (beside > 0) & (image > 0) & ~static & (np.abs(beside - image) < JUMP)
     return np.asarray(cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, _CROSS) > 0)

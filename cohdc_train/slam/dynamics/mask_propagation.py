@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
 from cohdc_train.slam.frame import View
 
 Floats = NDArray[np.float32]
@@ -31,26 +31,26 @@ _HISTORY = 45  # frames a late mask is carried through one by one; an older one 
 
 
 @dataclass(frozen=True)
-class Half:
+class HalfResFrame:
     """A frame at half size. gray: [h, w] uint8; depth: [h, w] m, 0 = no reading."""
 
     gray: NDArray[np.uint8]
     depth: Floats
 
 
-def halve(rgb: NDArray[np.uint8], depth: Floats) -> Half:
+def downsample(rgb: NDArray[np.uint8], depth: Floats) -> HalfResFrame:
     """rgb: [H, W, 3]; depth: [H, W] m, of which every second reading is taken: a mean would mix
     near and far.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     thin = np.ascontiguousarray(depth[::2, ::2])
     size = (thin.shape[1], thin.shape[0])
-    return Half(
+    return HalfResFrame(
         np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), thin
     )
 
 
-def halve_mask(mask: Mask) -> Mask:
+def downsample_mask(mask: Mask) -> Mask:
     """[H, W] bool. Returns [h, w] bool of half size, True where half of the four pixels are."""
     size = ((mask.shape[1] + 1) // 2, (mask.shape[0] + 1) // 2)
     return np.asarray(
@@ -58,7 +58,7 @@ def halve_mask(mask: Mask) -> Mask:
     )
 
 
-class Propagation:
+class MaskPropagator:
     """The newest mask, kept at the newest frame.
 
     `advance` takes every frame; `renew` takes a mask whenever one is ready, which may belong to an
@@ -68,31 +68,31 @@ class Propagation:
     def __init__(self) -> None:
         # Any: OpenCV's stubs do not know that the flow to start from may be None.
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-        self._frames: deque[tuple[int, Half, Floats]] = deque(
+        self._frames: deque[tuple[int, HalfResFrame, Floats]] = deque(
             maxlen=_HISTORY
         )  # number, frame, places in the one before
         self._grid: Floats | None = None
         self._mask: Mask | None = None
         self._number = 0
 
-    def advance(self, frame: Half) -> int:
+    def advance(self, frame: HalfResFrame) -> int:
         """Go on to the next frame, and the mask with it. Returns the frame's number, 1, 2, ..."""
         before = self._frames[-1][1] if self._frames else frame
         places = self._places(before, frame)
         self._number += 1
         self._frames.append((self._number, frame, places))
         if self._mask is not None:
-            self._mask = carry(self._mask, before, frame, places)
+            self._mask = propagate(self._mask, before, frame, places)
         return self._number
 
-    def renew(self, mask: Mask, number: int, frame: Half) -> None:
+    def update(self, mask: Mask, number: int, frame: HalfResFrame) -> None:
         """mask: [h, w] bool of the frame that `advance` gave this number, which has passed."""
         ahead = [entry for entry in self._frames if entry[0] > number]
         if ahead and ahead[0][0] > number + 1:  # so old that the frames between are forgotten
             _, newest, _ = ahead[-1]
             ahead = [(self._number, newest, self._places(frame, newest))]
         for _, later, places in ahead:
-            mask = carry(mask, frame, later, places)
+            mask = propagate(mask, frame, later, places)
             frame = later
         self._mask = mask
 
@@ -100,7 +100,7 @@ class Propagation:
         """[h, w] bool at the newest frame; None before the first mask."""
         return self._mask
 
-    def _places(self, old: Half, new: Half) -> Floats:
+    def _places(self, old: HalfResFrame, new: HalfResFrame) -> Floats:
         """[h, w, 2] px: where every pixel of the new frame was in the old one."""
         if self._grid is None:
             rows, columns = np.indices(new.gray.shape, dtype=np.float32)
@@ -110,7 +110,7 @@ class Propagation:
         return np.asarray(self._grid + self._flow.calc(new.gray, old.gray, None), dtype=np.float32)
 
 
-def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
+def propagate(mask: Mask, old: HalfResFrame, new: HalfResFrame, places: Floats) -> Mask:
     """One step. mask: [h, w] at the old frame; places: [h, w, 2] px in the old frame. Returns [h,
     w] at the new one.
 
@@ -156,15 +156,15 @@ def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:
 
 
 @dataclass(frozen=True)
-class Job:
-    """A frame that may be segmented. number: as Propagation counts."""
+class SegmentationJob:
+    """A frame that may be segmented. number: as MaskPropagator counts."""
 
     number: int
     view: View
-    half: Half
+    half: HalfResFrame
 
 
-class CarriedMasks:
+class PropagatedMask:
     """The newest mask there is, carried to every frame, and grown there by what its outline asked
     for.
 
@@ -172,26 +172,26 @@ class CarriedMasks:
     """
 
     def __init__(self) -> None:
-        self.newest: Job | None = None
+        self.newest: SegmentationJob | None = None
         self._growth = 0.0
-        self._propagation = Propagation()
+        self._propagation = MaskPropagator()
 
-    def advance(self, view: View) -> Job:
+    def advance(self, view: View) -> SegmentationJob:
         """Go on to the next view."""
-        half = halve(view.rgb, view.depth)
-        return Job(self._propagation.advance(half), view, half)
+        half = downsample(view.rgb, view.depth)
+        return SegmentationJob(self._propagation.advance(half), view, half)
 
-    def renew(self, job: Job, mask: Mask, growth: float) -> None:
+    def update(self, job: SegmentationJob, mask: Mask, growth: float) -> None:
         """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is
         to grow.
         """
         self.newest, self._growth = job, growth
-        self._propagation.renew(mask, job.number, job.half)
+        self._propagation.update(mask, job.number, job.half)
 
     def mask(self, view: View) -> Mask:
         """[H, W] bool, True = dynamic, for the view that was gone on to."""
         mask = self._propagation.mask()
         assert mask is not None
         height, width = view.rgb.shape[:2]
-        grown = grow(mask, self._growth / 2).astype(np.uint8)
+        grown = dilate_mask(mask, self._growth / 2).astype(np.uint8)
         return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)

@@ -35,7 +35,7 @@ _CLEARLY = 4.0  # times the limit: moving further counts no more than this
 _ROUNDS = 4  # groups taken out, one after the other
 
 
-def pose_of_rest(
+def estimate_static_pose(
     T_cw: Array,
     points: Array,
     seen: Observations,
@@ -54,7 +54,7 @@ def pose_of_rest(
     T_cw, inlier = optimize_pose(T_cw, points, seen, reprojection, prior=prior)
     for _ in range(_ROUNDS):
         rest = np.flatnonzero(~moving)
-        group = moving_group(T_cw, points[rest], seen.take(rest), reprojection, found[rest])
+        group = find_moving_cluster(T_cw, points[rest], seen.take(rest), reprojection, found[rest])
         if not group.any():
             break
         moving[rest[group]] = True
@@ -65,7 +65,7 @@ def pose_of_rest(
     return T_cw, inlier, moving
 
 
-def moving_group(
+def find_moving_cluster(
     T_cw: Array,
     points: Array,
     seen: Observations,
@@ -81,7 +81,7 @@ def moving_group(
     if len(points) < 3 * _LEAST:
         return nothing
     local = to_local(T_cw, points)
-    groups = nested_groups(local, np.minimum(found, _KNOWN))
+    groups = nested_clusters(local, np.minimum(found, _KNOWN))
     error = residuals(local, seen, reprojection)
     J = pose_jacobian(local, residual_jacobian(local, seen, reprojection))
     steps, covariances = _poses_without(groups, J, error, seen.limits)
@@ -124,7 +124,7 @@ def _poses_without(
     return -np.einsum("gab,gb->ga", covariances, g.sum(axis=0) - share @ g), covariances
 
 
-def nested_groups(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+def nested_clusters(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
     """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a
     judgeable size.
 

@@ -9,14 +9,14 @@ from cohdc_train.errors import DataError
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.live import LiveSource
-from cohdc_train.slam.io.sources import Layout
-from cohdc_train.slam.io.tum import Entry, read_entry
+from cohdc_train.slam.io.sources import SequenceFormat
+from cohdc_train.slam.io.tum import TimestampedImage, parse_entry
 
 _PNG, _PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
-class Followed(LiveSource):
+class GrowingSequence(LiveSource):
     """A sequence's folder while its lists grow.
 
     Ends with a file `done` in it or after `idle` s without a new line, when every listed pair has
@@ -25,7 +25,7 @@ class Followed(LiveSource):
     is raised, as it is when no frame comes.
     """
 
-    def __init__(self, folder: Path, camera: Camera, layout: Layout, idle: float) -> None:
+    def __init__(self, folder: Path, camera: Camera, layout: SequenceFormat, idle: float) -> None:
         super().__init__(camera)
         if not idle > 0:
             raise DataError(f"idle is {idle:g}; it must be above 0 s")
@@ -53,11 +53,11 @@ class Followed(LiveSource):
                 f"{self._folder}: no frame came in {self._idle:g} s; nothing is written"
             )
 
-    def _pairs(self) -> Iterator[tuple[Entry, Entry]]:
+    def _pairs(self) -> Iterator[tuple[TimestampedImage, TimestampedImage]]:
         """Pairs as soon as their partner is certain: when the second list has come as far as the
         entry.
         """
-        waiting: tuple[list[Entry], list[Entry]] = [], []
+        waiting: tuple[list[TimestampedImage], list[TimestampedImage]] = [], []
         heard = time.monotonic()
         while True:
             ended = (
@@ -76,7 +76,7 @@ class Followed(LiveSource):
                 entry = first.pop(0)
                 partner = min(second, key=lambda other: abs(other.t - entry.t), default=None)
                 if partner is None or abs(partner.t - entry.t) > self._layout.max_difference:
-                    self.without_depth += 1
+                    self.num_unpaired += 1
                     continue
                 del second[: second.index(partner) + 1]
                 yield entry, partner
@@ -102,9 +102,9 @@ class _GrowingList:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offset = self._number = 0
-        self._last: Entry | None = None
+        self._last: TimestampedImage | None = None
 
-    def news(self, ended: bool) -> list[Entry]:
+    def news(self, ended: bool) -> list[TimestampedImage]:
         """Entries since the last call; ended: the last line needs no end."""
         try:
             with self._path.open("rb") as file:
@@ -117,10 +117,10 @@ class _GrowingList:
         self._offset += len(text)
         return [entry for line in text.splitlines() if (entry := self._entry(line)) is not None]
 
-    def _entry(self, line: bytes) -> Entry | None:
+    def _entry(self, line: bytes) -> TimestampedImage | None:
         self._number += 1
         try:
-            entry = read_entry(self._path, self._number, line.decode("utf-8", "replace"))
+            entry = parse_entry(self._path, self._number, line.decode("utf-8", "replace"))
             if entry is not None and self._last is not None and entry.t <= self._last.t:
                 message = f"time stamp {entry.stamp} does not come after {self._last.stamp}"
                 raise DataError(f"{self._path}:{self._number}: {message}")

@@ -26,7 +26,7 @@ class LiveSource:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self.groundtruth: Path | None = None
-        self.without_depth = 0
+        self.num_unpaired = 0
         self._stopped = threading.Event()
 
     def __len__(self) -> int:
@@ -40,7 +40,7 @@ class LiveSource:
         self._stopped.set()
 
 
-class Live(LiveSource):
+class LiveCamera(LiveSource):
     """A camera of one's own: anything that gives (rgb, depth_m, t) one after the other, or None
     while nothing comes.
 
@@ -80,7 +80,7 @@ class Live(LiveSource):
 
 
 @contextmanager
-def stopped_by_ctrl_c(source: object) -> Iterator[None]:
+def stop_on_sigint(source: object) -> Iterator[None]:
     """While it is open, the first Ctrl-C stops a live source, whose results are written; the second
     interrupts as ever.
 

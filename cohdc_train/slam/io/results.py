@@ -23,7 +23,7 @@ _NAMES = (
 )
 
 
-def measure(
+def compute_metrics(
     records: list[FrameRecord], trajectory: Trajectory, truth: Trajectory | None, dropped: int = 0
 ) -> dict[str, Any]:
     """The numbers of metrics.json but the seed.
@@ -98,7 +98,7 @@ def write_run(
             )
 
 
-def publish_run(part: Path, out: Path) -> None:
+def move_into_place(part: Path, out: Path) -> None:
     """Move the files of a run into `out`, in place of those of a former one.
 
     A file that somebody else put there during the run stays, and is named on stderr.
@@ -107,7 +107,7 @@ def publish_run(part: Path, out: Path) -> None:
         print(f"{out / name}: is not of a run and was kept; this run's is lost", file=sys.stderr)
 
 
-def check_out(out: Path, cloud: bool) -> None:
+def check_output_dir(out: Path, cloud: bool) -> None:
     """Raise DataError when `out` cannot become a folder of results. Makes the folder above it.
 
     cloud: whether the run writes cloud.ply.

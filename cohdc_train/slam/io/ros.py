@@ -31,12 +31,12 @@ _DEPTHS = {
 _ROS_FROM_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def seconds(stamp: Any) -> float:
+def to_seconds(stamp: Any) -> float:
     """builtin_interfaces/Time to s."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
-def camera_of(info: Any) -> Camera:
+def camera_from_message(info: Any) -> Camera:
     """sensor_msgs/CameraInfo to a camera. Raises DataError for a lens that five coefficients do not
     describe.
     """
@@ -57,7 +57,7 @@ def camera_of(info: Any) -> Camera:
     )
 
 
-def rgb_of(image: Any) -> NDArray[np.uint8]:
+def rgb_from_message(image: Any) -> NDArray[np.uint8]:
     """sensor_msgs/Image to [H, W, 3] uint8 RGB. Raises DataError unless it is rgb8, bgr8, rgba8,
     bgra8 or mono8.
     """
@@ -70,7 +70,7 @@ def rgb_of(image: Any) -> NDArray[np.uint8]:
     return pixels.copy() if code is None else np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
 
 
-def depth_of(image: Any) -> NDArray[np.float32]:
+def depth_from_message(image: Any) -> NDArray[np.float32]:
     """sensor_msgs/Image to [H, W] m, 0 = no reading. Raises DataError unless it is 16UC1 (mm),
     mono16 or 32FC1 (m).
     """

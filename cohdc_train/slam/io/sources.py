@@ -9,19 +9,19 @@ from typing import Protocol
 
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.tum import Entry, read_depth, read_pairs, read_rgb
+from cohdc_train.slam.io.tum import TimestampedImage, read_depth, read_pairs, read_rgb
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """Views in the order of time, each made when it is asked for.
 
-    groundtruth: file in TUM's format, or None; without_depth: colour images left out for want of a
+    groundtruth: file in TUM's format, or None; num_unpaired: colour images left out for want of a
     depth image.
     """
 
     camera: Camera
     groundtruth: Path | None
-    without_depth: int
+    num_unpaired: int
 
     def __len__(self) -> int:
         """How many views will come, 0 where nobody knows."""
@@ -33,7 +33,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class Layout:
+class SequenceFormat:
     """How a folder holds frames: two lists in the manner of TUM's rgb.txt, paired by their stamps.
 
     max_difference: s between the two of a pair; view: makes a view of them, or raises DataError for
@@ -43,31 +43,31 @@ class Layout:
     first: str
     second: str
     max_difference: float
-    view: Callable[[Entry, Entry], View]
+    view: Callable[[TimestampedImage, TimestampedImage], View]
 
 
-def rgbd_layout(camera: Camera) -> Layout:
+def rgbd_format(camera: Camera) -> SequenceFormat:
     """TUM's layout: rgb.txt and depth.txt."""
 
-    def view(color: Entry, depth: Entry) -> View:
+    def view(color: TimestampedImage, depth: TimestampedImage) -> View:
         rgb, meters = read_rgb(color.image, camera), read_depth(depth.image, camera)
         return View(color.t, color.stamp, color.image.stem, rgb, meters, depth.t)
 
-    return Layout("rgb.txt", "depth.txt", 0.02, view)
+    return SequenceFormat("rgb.txt", "depth.txt", 0.02, view)
 
 
-class Recorded:
+class RecordedSequence:
     """A recorded sequence, in TUM's layout when no other is given.
 
     Raises DataError as read_pairs does, and, while views are taken, for images that are broken or
     of another size.
     """
 
-    def __init__(self, folder: Path, camera: Camera, layout: Layout | None = None) -> None:
+    def __init__(self, folder: Path, camera: Camera, layout: SequenceFormat | None = None) -> None:
         self.camera = camera
-        self._layout = layout or rgbd_layout(camera)
+        self._layout = layout or rgbd_format(camera)
         lists = folder / self._layout.first, folder / self._layout.second
-        self._pairs, self.without_depth = read_pairs(*lists, self._layout.max_difference)
+        self._pairs, self.num_unpaired = read_pairs(*lists, self._layout.max_difference)
         truth = folder / "groundtruth.txt"
         self.groundtruth = truth if truth.is_file() else None
 

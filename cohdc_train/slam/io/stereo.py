@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Layout
-from cohdc_train.slam.io.tum import Entry, read_rgb
+from cohdc_train.slam.io.sources import SequenceFormat
+from cohdc_train.slam.io.tum import TimestampedImage, read_rgb
 
 _MAX_DIFFERENCE = (
     0.005  # s between the two images of a pair: a walking camera moves 5 mm in that time
@@ -89,13 +89,13 @@ class StereoMatcher:
         return np.where(matched, Z, 0).astype(np.float32)
 
 
-def stereo_layout(camera: Camera) -> Layout:
+def stereo_format(camera: Camera) -> SequenceFormat:
     """Rectified pairs: left.txt and right.txt; views are the left camera's. Raises DataError as
     StereoMatcher does.
     """
     matcher = StereoMatcher(camera)
 
-    def view(left: Entry, right: Entry) -> View:
+    def view(left: TimestampedImage, right: TimestampedImage) -> View:
         pair = read_rgb(left.image, camera), read_rgb(right.image, camera)
         start = time.perf_counter()
         depth = matcher(*pair)
@@ -108,4 +108,4 @@ def stereo_layout(camera: Camera) -> Layout:
             depth_ms=1e3 * (time.perf_counter() - start),
         )
 
-    return Layout("left.txt", "right.txt", _MAX_DIFFERENCE, view)
+    return SequenceFormat("left.txt", "right.txt", _MAX_DIFFERENCE, view)

@@ -31,13 +31,13 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sequence:
-    """frames in the order of time; `without_depth`: how many colour images found no depth image
+    """frames in the order of time; `num_unpaired`: how many colour images found no depth image
     near enough.
     """
 
     folder: Path
     frames: tuple[Frame, ...]
-    without_depth: int
+    num_unpaired: int
 
     @property
     def groundtruth(self) -> Path | None:
@@ -47,7 +47,7 @@ class Sequence:
 
 
 @dataclass(frozen=True)
-class Entry:
+class TimestampedImage:
     """A line of a list. t: s; stamp: t as the line writes it; image: the file it names."""
 
     t: float
@@ -71,7 +71,7 @@ def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
 
 def read_pairs(
     first: Path, second: Path, max_difference: float
-) -> tuple[list[tuple[Entry, Entry]], int]:
+) -> tuple[list[tuple[TimestampedImage, TimestampedImage]], int]:
     """Two lists paired as read_sequence does, and how many of the first stay alone. Raises
     DataError as it does.
     """
@@ -134,15 +134,15 @@ def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
         raise DataError(f"{path}: image is {found}, the camera says {expected}")
 
 
-def _read_list(path: Path) -> list[Entry]:
+def _read_list(path: Path) -> list[TimestampedImage]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         layout = "a TUM sequence has rgb.txt and depth.txt, a stereo one left.txt and right.txt"
         raise DataError(f"{path}: cannot be read; {layout} ({error})") from error
-    entries: list[Entry] = []
+    entries: list[TimestampedImage] = []
     for number, line in enumerate(lines, start=1):
-        entry = read_entry(path, number, line)
+        entry = parse_entry(path, number, line)
         if entry is None:
             continue
         if entries and entry.t <= entries[-1].t:
@@ -157,7 +157,7 @@ def _read_list(path: Path) -> list[Entry]:
     return entries
 
 
-def read_entry(path: Path, number: int, line: str) -> Entry | None:
+def parse_entry(path: Path, number: int, line: str) -> TimestampedImage | None:
     """A line of the list `path`; None for a comment and a blank one. Raises DataError naming file
     and line.
     """
@@ -172,4 +172,4 @@ def read_entry(path: Path, number: int, line: str) -> Entry | None:
         raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not a number") from error
     if not math.isfinite(stamp):
         raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not finite")
-    return Entry(stamp, words[0], path.parent / words[1])
+    return TimestampedImage(stamp, words[0], path.parent / words[1])

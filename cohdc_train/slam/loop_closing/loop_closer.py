@@ -8,8 +8,8 @@ from scipy import sparse
 
 from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.geometry.se3 import inverse
-from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognition
-from cohdc_train.slam.loop_closing.verification import Loop, LoopVerifier
+from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognizer
+from cohdc_train.slam.loop_closing.verification import LoopConstraint, LoopVerifier
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
 from cohdc_train.slam.mapping.map import Map
@@ -35,9 +35,9 @@ class LoopCloser:
     def __init__(self, world: Map, reprojection: ReprojectionModel, seed: int = 0) -> None:
         self.closed = 0
         self._world, self._reprojection = world, reprojection
-        self._places = PlaceRecognition(seed)
+        self._places = PlaceRecognizer(seed)
         self._pictures: dict[int, DepthImage] = {}  # of the keyframes in the map, by index
-        self._loops: list[Loop] = []
+        self._loops: list[LoopConstraint] = []
         self._verify = LoopVerifier(world, reprojection, np.random.default_rng(seed))
 
     def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
@@ -63,7 +63,7 @@ class LoopCloser:
         self._places.remove(keyframe.index)
 
     @property
-    def ends(self) -> set[int]:
+    def loop_keyframes(self) -> set[int]:
         """Indices of the keyframes that loops hold on to."""
         return {index for loop in self._loops for index in (loop.old, *loop.new.tolist())}
 
@@ -72,21 +72,21 @@ class LoopCloser:
         keyframes = self._world.keyframes[:-1]
         if len(keyframes) <= _RECENT:
             return []
-        likeness = self._places.likeness(keyframe.features.descriptors)
+        similarity = self._places.similarity(keyframe.features.descriptors)
         shared = self._world.shared(keyframe.seen_points(), keyframes)
         near = shared >= _COVISIBLE
-        least = _LIKENESS * float(np.median(likeness[near])) if near.any() else 0.0
-        likeness[near] = 0.0
-        likeness[-_RECENT:] = 0.0
+        least = _LIKENESS * float(np.median(similarity[near])) if near.any() else 0.0
+        similarity[near] = 0.0
+        similarity[-_RECENT:] = 0.0
         found: list[int] = []
-        for place in np.argsort(-likeness, kind="stable").tolist():
-            if likeness[place] <= least or len(found) == _CANDIDATES:
+        for place in np.argsort(-similarity, kind="stable").tolist():
+            if similarity[place] <= least or len(found) == _CANDIDATES:
                 break
             if all(abs(place - other) >= _APART for other in found):
                 found.append(place)
         return [keyframes[place] for place in found]
 
-    def _correct(self, loop: Loop) -> bool:
+    def _correct(self, loop: LoopConstraint) -> bool:
         """Optimise the graph with the new loop and move the map, unless the graph refuses the loop."""
         edges = self._edges(loop)
         before = np.stack([k.T_cw for k in self._world.keyframes])
@@ -97,7 +97,7 @@ class LoopCloser:
         self._world.move(after)
         return True
 
-    def _edges(self, newest: Loop) -> Edges:
+    def _edges(self, newest: LoopConstraint) -> Edges:
         """Neighbours in time, old neighbours in view, and all loops; the newest loop comes last."""
         poses = np.stack([k.T_cw for k in self._world.keyframes])
         first, second, shared = _graph_pairs(_shared_points(self._world))
@@ -114,7 +114,7 @@ class LoopCloser:
             np.arange(len(first) + len(old)) >= len(first),
         )
 
-    def _join(self, loop: Loop) -> None:
+    def _join(self, loop: LoopConstraint) -> None:
         """Make the points one that both ends of the loop have, and adjust around the newest
         keyframe.
         """
@@ -129,9 +129,11 @@ class LoopCloser:
 def _shared_points(world: Map) -> NDArray[np.int64]:
     """[k, k] how many points each two keyframes share."""
     seen = [k.seen_points() for k in world.keyframes]
-    ends = np.concatenate([[0], np.cumsum([len(ids) for ids in seen])])
-    ones = np.ones(int(ends[-1]), dtype=np.int64)
-    incidence = sparse.csr_matrix((ones, np.concatenate(seen), ends), shape=(len(seen), world.size))
+    loop_keyframes = np.concatenate([[0], np.cumsum([len(ids) for ids in seen])])
+    ones = np.ones(int(loop_keyframes[-1]), dtype=np.int64)
+    incidence = sparse.csr_matrix(
+        (ones, np.concatenate(seen), loop_keyframes), shape=(len(seen), world.size)
+    )
     return np.asarray((incidence @ incidence.T).toarray(), dtype=np.int64)
 
 

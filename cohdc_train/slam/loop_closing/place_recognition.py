@@ -11,7 +11,7 @@ _TABLES = 8
 _BITS = 16  # of 256, drawn per table: two descriptors meet in a table when all these agree
 
 
-class PlaceRecognition:
+class PlaceRecognizer:
     """An index over keyframes by locality-sensitive hashing.
 
     Each table hashes a descriptor by its own random bits. A hash that few keyframes hold says much,
@@ -34,7 +34,7 @@ class PlaceRecognition:
         """Take out a keyframe."""
         self._holders[self._hashes.pop(index)] -= 1
 
-    def likeness(self, descriptors: NDArray[np.uint64]) -> NDArray[np.float64]:
+    def similarity(self, descriptors: NDArray[np.uint64]) -> NDArray[np.float64]:
         """descriptors: [n, 4]. Returns [keyframes] 0..1, the weighed share of the hashes that each
         one has too, in the order they were added."""
         hashes = self._hash(descriptors)

@@ -36,7 +36,7 @@ _REFINED_RAD = 0.02
 
 
 @dataclass(frozen=True)
-class Loop:
+class LoopConstraint:
     """A checked loop: for every entry, T carries from the camera of keyframe `old` to the camera of
     keyframe `new`.
 
@@ -58,7 +58,7 @@ class LoopVerifier:
 
     def __call__(
         self, keyframe: Keyframe, old: Keyframe, pictures: Mapping[int, DepthImage]
-    ) -> Loop | None:
+    ) -> LoopConstraint | None:
         """The loop between a keyframe and an old one, or None. pictures: of both, by index."""
         ids = old.seen_points()
         place = self._world.points_of(self._world.covisible(ids, _PLACE))
@@ -75,7 +75,7 @@ class LoopVerifier:
         # The neighbours' own answers stand for themselves: an error in one edge is then not
         # repeated in all.
         Ts = [T, *(pose @ inverse(old.T_cw) for _, pose in neighbors)]
-        return Loop(old.index, np.array(new), np.stack(Ts))
+        return LoopConstraint(old.index, np.array(new), np.stack(Ts))
 
     def _locate(
         self, keyframe: Keyframe, ids: NDArray[np.int64], place: NDArray[np.int64]

@@ -34,7 +34,7 @@ class LoopCloserLike(Protocol):
     closed: int
 
     @property
-    def ends(self) -> set[int]:
+    def loop_keyframes(self) -> set[int]:
         """Indices of the keyframes that loops refer to."""
 
     def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
@@ -139,7 +139,7 @@ class LocalMapper:
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
         if self._loops is not None:
             self._loops.close(keyframe, picture())
-            in_use = in_use | self._loops.ends
+            in_use = in_use | self._loops.loop_keyframes
         culling = self._config.keyframe_culling
         if culling.enabled:
             window = self._config.bundle_adjustment.local_keyframes

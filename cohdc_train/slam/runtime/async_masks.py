@@ -13,24 +13,28 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
+from cohdc_train.slam.dynamics.mask_propagation import (
+    PropagatedMask,
+    SegmentationJob,
+    downsample_mask,
+)
 from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.runtime.executors import NICE
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
 
-Outline = Callable[[View], tuple[Mask, float]]
+SegmentFunction = Callable[[View], tuple[Mask, float]]
 
 
 @dataclass(frozen=True)
 class _Done:
-    job: Job
+    job: SegmentationJob
     mask: NDArray[np.bool_]  # half size
     growth: float  # px
     ms: float
 
 
-class AsyncMasks:
+class AsyncSegmenter:
     """A mask for every frame from a segmenter that keeps up with only some.
 
     outline: view -> mask [H, W], True = dynamic, and by how many px it is to grow. It runs in a
@@ -42,17 +46,17 @@ class AsyncMasks:
     worker.
     """
 
-    def __init__(self, outline: Outline) -> None:
+    def __init__(self, segment: SegmentFunction) -> None:
         self.ages: list[float] = []
         self.segment_ms: list[float] = []
-        self._outline = outline
-        self._carried = CarriedMasks()
-        self._jobs: LatestSlot[Job] = LatestSlot()
+        self._segment = segment
+        self._carried = PropagatedMask()
+        self._jobs: LatestSlot[SegmentationJob] = LatestSlot()
         self._results: LatestSlot[_Done] = LatestSlot()
         self._busy = False
         self._worker = threading.Thread(target=self._work, name="segmenter", daemon=True)
 
-    def __enter__(self) -> "AsyncMasks":
+    def __enter__(self) -> "AsyncSegmenter":
         self._worker.start()
         return self
 
@@ -86,7 +90,7 @@ class AsyncMasks:
             return
         self._busy = False
         self.segment_ms.append(done.ms)
-        self._carried.renew(done.job, done.mask, done.growth)
+        self._carried.update(done.job, done.mask, done.growth)
 
     def _work(self) -> None:
         if sys.platform == "linux":
@@ -94,8 +98,10 @@ class AsyncMasks:
         try:
             while (job := self._jobs.take()) is not None:
                 start = time.perf_counter()
-                mask, growth = self._outline(job.view)
-                done = _Done(job, halve_mask(mask), growth, 1e3 * (time.perf_counter() - start))
+                mask, growth = self._segment(job.view)
+                done = _Done(
+                    job, downsample_mask(mask), growth, 1e3 * (time.perf_counter() - start)
+                )
                 self._results.put(done)
         except Exception as error:
             self._results.close(error)

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Source
+from cohdc_train.slam.io.sources import FrameSource
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
 
 
@@ -52,12 +52,12 @@ class PacedSource:
     read as fast; then all later ones are due so much later.
     """
 
-    def __init__(self, source: Source, clock: Clock | None = None) -> None:
+    def __init__(self, source: FrameSource, clock: Clock | None = None) -> None:
         self.camera: Camera = source.camera
         self.groundtruth: Path | None = source.groundtruth
-        self.without_depth = source.without_depth
+        self.num_unpaired = source.num_unpaired
         self.latencies: list[float] = []
-        self.behind = 0.0
+        self.playback_delay_s = 0.0
         self._source = source
         self._clock = clock or WallClock()
         self._slot: LatestSlot[tuple[View, float]] = LatestSlot()
@@ -72,13 +72,13 @@ class PacedSource:
         """Views that were not given out."""
         return self._slot.dropped
 
-    def spent(self) -> float:
+    def frame_time_used(self) -> float:
         """Share of the time between views that has gone since the latest was due; work beyond 1
         holds up the next.
         """
         return (self._clock.now() - self._due) / max(self._between, 1e-6)
 
-    def answered(self) -> None:
+    def mark_answered(self) -> None:
         """What was wanted of the latest view is known."""
         if not self._answered:
             self.latencies.append(self._clock.now() - self._due)
@@ -115,7 +115,7 @@ class PacedSource:
             view, self._due = item
             self._answered = False
             yield view
-            self.answered()
+            self.mark_answered()
 
     def _read(self, views: Iterator[View], start: float) -> None:
         before = float("-inf")
@@ -123,8 +123,8 @@ class PacedSource:
             for view in views:
                 due = self._clock.now()
                 if len(self):
-                    self.behind = max(self.behind, due - (start + view.t))
-                    due = start + view.t + self.behind
+                    self.playback_delay_s = max(self.playback_delay_s, due - (start + view.t))
+                    due = start + view.t + self.playback_delay_s
                     self._clock.wait_until(due)
                 if self._stop.is_set():
                     return

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def single_threaded() -> Iterator[None]:
     """For a `with` block; with a fixed seed of OpenCV's random numbers.
 
     Both are the whole process's: of two blocks at once the one that ends first takes the other's

@@ -13,18 +13,18 @@ import numpy as np
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, MaskSource, SegmenterMasks, no_masks
 from cohdc_train.slam.frame import Pose, PoseCallback
 from cohdc_train.slam.io.results import quantiles
-from cohdc_train.slam.io.sources import Source
-from cohdc_train.slam.runtime.async_masks import AsyncMasks
+from cohdc_train.slam.io.sources import FrameSource
+from cohdc_train.slam.runtime.async_masks import AsyncSegmenter
 from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.runtime.paced_source import PacedSource
 
 
 @dataclass(frozen=True)
-class Workers:
+class RealtimeWorkers:
     """The parts of a run that others wait for no longer. masks: None when nothing is masked."""
 
     source: PacedSource
-    masks: AsyncMasks | None
+    masks: AsyncSegmenter | None
     executor: Executor
 
     @property
@@ -32,15 +32,15 @@ class Workers:
         """Every frame's mask."""
         return self.masks or no_masks
 
-    def answering(self, on_pose: PoseCallback | None) -> PoseCallback:
+    def report_latency(self, on_pose: PoseCallback | None) -> PoseCallback:
         """The same, after the source has learnt that there is an answer."""
 
-        def answered(pose: Pose) -> None:
-            self.source.answered()
+        def mark_answered(pose: Pose) -> None:
+            self.source.mark_answered()
             if on_pose is not None:
                 on_pose(pose)
 
-        return answered
+        return mark_answered
 
     def metrics(self) -> dict[str, Any]:
         """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until its pose
@@ -48,7 +48,7 @@ class Workers:
         frames were `dropped`; by how many seconds playing fell `behind` the recording."""
         result: dict[str, Any] = {
             "dropped": self.source.dropped,
-            "behind_s": self.source.behind,
+            "behind_s": self.source.playback_delay_s,
             "latency_ms": _milliseconds(self.source.latencies),
         }
         if self.masks is not None:
@@ -58,12 +58,14 @@ class Workers:
 
 
 @contextmanager
-def workers(source: Source, masks: MaskFolder | SegmenterMasks | None) -> Iterator[Workers]:
+def start_workers(
+    source: FrameSource, masks: MaskFolder | SegmenterMasks | None
+) -> Iterator[RealtimeWorkers]:
     """Start them; when the block ends, they end."""
     with ExitStack() as stack:
         executor = stack.enter_context(worker_process())
-        beside = None if masks is None else stack.enter_context(AsyncMasks(masks.outline))
-        yield Workers(stack.enter_context(PacedSource(source)), beside, executor)
+        workers = None if masks is None else stack.enter_context(AsyncSegmenter(masks.segment))
+        yield RealtimeWorkers(stack.enter_context(PacedSource(source)), workers, executor)
 
 
 def _milliseconds(seconds: list[float]) -> dict[str, float]:

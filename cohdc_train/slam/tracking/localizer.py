@@ -11,7 +11,7 @@ from cohdc_train.slam.config import (
     RansacConfig,
     TrackingConfig,
 )
-from cohdc_train.slam.dynamics.motion_segmentation import pose_of_rest
+from cohdc_train.slam.dynamics.motion_segmentation import estimate_static_pose
 from cohdc_train.slam.features.descriptors import thumbnail
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.geometry.se3 import Array
@@ -110,7 +110,7 @@ class Localizer:
         segments_motion = self._config.motion_segmentation.enabled
         if segments_motion:
             num_found = self.map.found[ids]
-            T_cw, inlier, moving = pose_of_rest(
+            T_cw, inlier, moving = estimate_static_pose(
                 estimate.T_cw, points, seen, self._reprojection, num_found, estimate.prior
             )
         else:

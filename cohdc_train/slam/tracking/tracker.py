@@ -203,7 +203,7 @@ class Tracker:
             return mask
         around = self.map.covisible(last.matches.points, self._config.local_keyframes)
         T_cw = prediction.prior.T_cw
-        return self.parts.dynamic_mask.of(mask, frame.depth, T_cw, around, frame.timestamp)
+        return self.parts.dynamic_mask.estimate(mask, frame.depth, T_cw, around, frame.timestamp)
 
     def _extract(self, frame: RGBDFrame, mask: Mask | None) -> Features:
         """Return the keypoints of a frame outside a mask, with depth."""
@@ -265,7 +265,7 @@ class Tracker:
             features,
             point_ids,
             thumbnail(frame.rgb),
-            self.parts.free_space.nearest(frame.depth),
+            self.parts.free_space.min_depth_grid(frame.depth),
         )
         self.parts.mapper.insert(
             keyframe,
@@ -320,7 +320,7 @@ class Tracker:
         self.state.set_lost(bool(self.map.keyframes))
         self.parts.motion.reset()
         if self.parts.dynamic_mask is not None:
-            self.parts.dynamic_mask.forget()
+            self.parts.dynamic_mask.reset()
 
     def _apply_map_updates(self, update: Callable[[], None]) -> None:
         """Let the map change; the last pose moves with its reference keyframe."""

@@ -11,19 +11,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.masks import grow
+from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.frame import FrameRecord, View
-from cohdc_train.slam.geometry.camera import Camera, maps_onto
+from cohdc_train.slam.geometry.camera import Camera, undistortion_maps
 from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.slam.visualization.point_cloud import Cloud
+from cohdc_train.slam.visualization.point_cloud import PointCloud
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 _EDGE = 0.04  # of the depth: a larger step within two pixels is an edge, where near and far mix
 _MASK_BAND = (
     0.01  # of the image's width by which a mask grows once more: depth images smear outlines
 )
-_UNITS = 50_000.0  # per camera.far, in the file of kept depth images, which hold 1.3 of it
+_UNITS = 50_000.0  # per camera.max_depth_m, in the file of kept depth images, which hold 1.3 of it
 _NOISE = (
     0.03,
     0.01,
@@ -43,8 +43,8 @@ class KeyframeImages:
     def __init__(self, camera: Camera, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
         self._index: list[tuple[float, int, int]] = []  # t, bytes of colour, bytes of depth
-        self._maps = maps_onto(camera, camera) if camera.distortion.any() else None
-        self._units = _UNITS / camera.far  # per m
+        self._maps = undistortion_maps(camera, camera) if camera.distortion.any() else None
+        self._units = _UNITS / camera.max_depth_m  # per m
 
     def __enter__(self) -> Self:
         return self
@@ -58,7 +58,10 @@ class KeyframeImages:
         """Keep the frame when it became a keyframe."""
         if not record.pose.keyframe:
             return
-        rgb, depth = view.rgb, np.minimum(unmasked(view.depth, mask), 65_535 / self._units)
+        rgb, depth = (
+            view.rgb,
+            np.minimum(remove_dynamic_depth(view.depth, mask), 65_535 / self._units),
+        )
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
@@ -84,14 +87,16 @@ class KeyframeImages:
             )
 
 
-def unmasked(depth: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+def remove_dynamic_depth(
+    depth: NDArray[np.float32], mask: NDArray[np.bool_] | None
+) -> NDArray[np.float32]:
     """[H, W] m, 0 = none: depth without what lies under the mask, which is grown once more."""
     if mask is None:
         return depth
-    return np.where(grow(mask, _MASK_BAND * mask.shape[1]), 0, depth).astype(np.float32)
+    return np.where(dilate_mask(mask, _MASK_BAND * mask.shape[1]), 0, depth).astype(np.float32)
 
 
-def sure(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def filter_depth(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     """[H, W] m, 0 = none: depth without readings beside a depth edge or beyond the sensor's good
     range.
     """
@@ -100,7 +105,7 @@ def sure(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     allowed = _EDGE * depth
     if camera.baseline:
         allowed = np.maximum(allowed, 2 * _spread(camera) * depth**2)
-    return np.where((depth <= camera.far) & (step <= allowed), depth, 0).astype(np.float32)
+    return np.where((depth <= camera.max_depth_m) & (step <= allowed), depth, 0).astype(np.float32)
 
 
 def _spread(camera: Camera) -> float:
@@ -117,7 +122,9 @@ def _nearest(depth: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[n
     )
 
 
-def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, voxel: float) -> Cloud:
+def fuse(
+    images: Iterable[Frame], poses: dict[float, Array], camera: Camera, voxel: float
+) -> PointCloud:
     """One point per cube of `voxel` m that at least two keyframes saw and that the others do not
     see through.
 
@@ -129,7 +136,7 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
     count = 0
     for t, rgb, depth in images:
         if t in poses:
-            depth = sure(depth, camera)
+            depth = filter_depth(depth, camera)
             seen = depth > 0
             local = rays[seen] * depth[seen][:, None]
             grid.add((local - poses[t][:3, 3]) @ poses[t][:3, :3], rgb[seen], count)
@@ -138,8 +145,8 @@ def fuse(images: Iterable[Frame], poses: dict[float, Array], camera: Camera, vox
     balance = np.zeros(len(points), dtype=np.int32)
     for t, _, depth in images:
         if t in poses:
-            balance += _evidence(points, depth, poses[t], camera)
-    return Cloud(points[balance > 0], colors[balance > 0])
+            balance += visibility_votes(points, depth, poses[t], camera)
+    return PointCloud(points[balance > 0], colors[balance > 0])
 
 
 def _rays(camera: Camera) -> Array:
@@ -149,7 +156,7 @@ def _rays(camera: Camera) -> Array:
     return camera.backproject(pixels, np.ones(u.size)).reshape(*u.shape, 3)
 
 
-def _evidence(
+def visibility_votes(
     points: Array, depth: NDArray[np.float32], T_cw: Array, camera: Camera
 ) -> NDArray[np.int32]:
     """[n] what one keyframe says of every point: 1 = there it is, -2 = the view goes through it, 0

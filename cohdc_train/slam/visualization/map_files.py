@@ -15,8 +15,8 @@ from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.io.ply import write_ply
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.slam.visualization.depth_fusion import KeyframeImages, fuse
-from cohdc_train.slam.visualization.point_cloud import PointColors
-from cohdc_train.slam.visualization.top_view import from_above
+from cohdc_train.slam.visualization.point_cloud import PointColorRecorder
+from cohdc_train.slam.visualization.top_view import render_top_view
 
 _VOXEL = 0.01  # m
 
@@ -28,7 +28,7 @@ class MapFiles:
 
     def __init__(self, camera: Camera, folder: Path, cloud: bool) -> None:
         self._folder = folder
-        self._colors = PointColors()
+        self._colors = PointColorRecorder()
         self._open = ExitStack()
         self._images = self._open.enter_context(KeyframeImages(camera, folder)) if cloud else None
 
@@ -58,5 +58,5 @@ class MapFiles:
             cloud = fuse(self._images, frames, tracker.camera, _VOXEL)
             write_ply(self._folder / "cloud.ply", cloud.points, cloud.colors)
         if len(poses):
-            picture = cv2.cvtColor(from_above(cloud, list(poses)), cv2.COLOR_RGB2BGR)
+            picture = cv2.cvtColor(render_top_view(cloud, list(poses)), cv2.COLOR_RGB2BGR)
             write_bytes(self._folder / "map.png", cv2.imencode(".png", picture)[1].tobytes())

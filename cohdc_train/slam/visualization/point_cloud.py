@@ -14,7 +14,7 @@ _SEEN_BY = 3  # keyframes that confirm a point
 
 
 @dataclass(frozen=True)
-class Cloud:
+class PointCloud:
     """points: [n, 3] in the world, m; colours: [n, 3] uint8 RGB."""
 
     points: Array
@@ -24,7 +24,7 @@ class Cloud:
         return len(self.points)
 
 
-class PointColors:
+class PointColorRecorder:
     """Watches a run and keeps the colours of the map's keyframes' corners (some 3 kB each), for the
     points they are.
     """
@@ -44,7 +44,7 @@ class PointColors:
             there = {keyframe.t for keyframe in tracker.map.keyframes}
             self._colors = {t: colors for t, colors in self._colors.items() if t in there}
 
-    def cloud(self, world: Map) -> Cloud:
+    def cloud(self, world: Map) -> PointCloud:
         """The points that at least three keyframes see (all of them, in a map of fewer), in the
         last one's colours.
         """
@@ -53,4 +53,4 @@ class PointColors:
             keypoints = np.flatnonzero(keyframe.point_ids >= 0)
             colors[keyframe.point_ids[keypoints]] = self._colors[keyframe.t][keypoints]
         enough = world.num_observations[: world.size] >= max(1, min(_SEEN_BY, len(world.keyframes)))
-        return Cloud(world.positions[: world.size][enough], colors[enough])
+        return PointCloud(world.positions[: world.size][enough], colors[enough])

@@ -15,7 +15,7 @@ from cohdc_train.errors import CohdcError, MissingExtraError
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.slam.visualization.point_cloud import PointColors
+from cohdc_train.slam.visualization.point_cloud import PointColorRecorder
 
 _LAST = 5.0  # s that rerun has for the rest when a run is over
 _MEMORY = "25%"  # of the machine's, which the viewer may fill before it forgets the oldest
@@ -25,7 +25,7 @@ _MASK = (230, 40, 40)  # RGB
 _WAY = (250, 160, 40)
 
 
-class Viewer:
+class RerunViewer:
     """Watches a run and shows it. window: open rerun's viewer; file: write an .rrd for it, whole
     when the run is over.
 
@@ -41,7 +41,7 @@ class Viewer:
             raise MissingExtraError(message) from error
         self._rerun: Any = rerun
         self._stream = rerun.RecordingStream("cohdc slam")
-        self._colors = PointColors()
+        self._colors = PointColorRecorder()
         self._start: float | None = None
         self._file = file
         self._open(window)

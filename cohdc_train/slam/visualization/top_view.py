@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.geometry.se3 import Array
-from cohdc_train.slam.visualization.point_cloud import Cloud
+from cohdc_train.slam.visualization.point_cloud import PointCloud
 
 _SIDE = 900  # px of the picture's longer side
 _BORDER = 20  # px
@@ -15,7 +15,7 @@ _ABOVE = 0.4  # m above the cameras from which on things are left out: a ceiling
 _RED = (230, 40, 40)  # RGB
 
 
-def from_above(cloud: Cloud, poses: Sequence[Array]) -> NDArray[np.uint8]:
+def render_top_view(cloud: PointCloud, poses: Sequence[Array]) -> NDArray[np.uint8]:
     """A map as seen from above, the way of the camera in red.
 
     poses: T_wc [4, 4] m, at least one. Up is where the cameras' upper edges point on average; the

@@ -12,13 +12,13 @@ from plane_world import CAMERA, camera_path, passer_by, render, room
 
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.dynamics.dynamic_mask import DynamicMaskEstimator
-from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker, Reference
-from cohdc_train.slam.dynamics.motion_segmentation import moving_group, pose_of_rest
+from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker, ReferenceDepth
+from cohdc_train.slam.dynamics.motion_segmentation import estimate_static_pose, find_moving_cluster
 from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, exp_se3
-from cohdc_train.slam.io.live import Live
+from cohdc_train.slam.io.live import LiveCamera
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.pose import optimize_pose
@@ -50,9 +50,9 @@ def found(
 ) -> NDArray[np.bool_]:
     geometry = FreeSpaceChecker(camera)
     comparison = geometry.compare(
-        now, T_cw, [Reference(STILL, geometry.nearest(image)) for image in before]
+        now, T_cw, [ReferenceDepth(STILL, geometry.min_depth_grid(image)) for image in before]
     )
-    return geometry.fine(geometry.movers(comparison))
+    return geometry.upsample(geometry.find_moving(comparison))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
@@ -90,7 +90,7 @@ def boxes(*lefts: int) -> NDArray[np.bool_]:
 def test_a_masked_thing_that_has_stood_still_is_told_from_one_that_came() -> None:
     before, geometry = with_box(wall(), 30, 1.5), FreeSpaceChecker(CAMERA)
     now = with_box(before, 200, 1.5)
-    references = [Reference(STILL, geometry.nearest(before))] * 3
+    references = [ReferenceDepth(STILL, geometry.min_depth_grid(before))] * 3
     rests = geometry.static_components(boxes(30, 200), geometry.compare(now, STILL, references))
     np.testing.assert_array_equal(rests, boxes(30))
     blind = geometry.compare(np.zeros_like(now), STILL, references)
@@ -100,10 +100,13 @@ def test_a_masked_thing_that_has_stood_still_is_told_from_one_that_came() -> Non
 def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
     geometry, box = FreeSpaceChecker(CAMERA), with_box(wall(), 30, 1.5)
     masks = DynamicMaskEstimator(geometry)
-    seen = [keyframe(0, 10.0, geometry.nearest(box)), keyframe(1, 10.5, geometry.nearest(box))]
+    seen = [
+        keyframe(0, 10.0, geometry.min_depth_grid(box)),
+        keyframe(1, 10.5, geometry.min_depth_grid(box)),
+    ]
 
     def mask_at(t: float, depth: Depth) -> NDArray[np.bool_] | None:
-        return masks.of(boxes(30), depth, STILL, seen, t)
+        return masks.estimate(boxes(30), depth, STILL, seen, t)
 
     np.testing.assert_array_equal(mask_at(11.0, box), boxes(30))
     assert not np.any(mask_at(13.0, box))
@@ -111,10 +114,10 @@ def test_a_mask_is_released_only_after_a_rest_and_movers_join_it() -> None:
     assert came is not None
     assert came[90:150, 210:270].all()
     assert not came[:, :100].any()
-    assert masks.of(None, wall(1.0), STILL, seen, 13.0) is None, (
+    assert masks.estimate(None, wall(1.0), STILL, seen, 13.0) is None, (
         "all of it moves: the pose is wrong"
     )
-    assert masks.of(None, box, STILL, seen, 13.0) is None
+    assert masks.estimate(None, box, STILL, seen, 13.0) is None
 
 
 def keyframe(index: int, t: float, nearest: Depth) -> Keyframe:
@@ -146,7 +149,7 @@ def test_who_is_at_rest_is_of_use_to_tracking_but_stays_masked_to_watchers(tmp_p
 
     play(
         tracker,
-        Live(CAMERA, frames),
+        LiveCamera(CAMERA, frames),
         lambda view: views[round(5 * view.t)][2],
         tmp_path / "pictures",
         [observer],
@@ -162,8 +165,10 @@ def test_the_camera_may_move() -> None:
     path = camera_path(40)
     first, second = (render(room(), path[k])[1] for k in (0, 15))
     geometry = FreeSpaceChecker(CAMERA)
-    references = [Reference(np.linalg.inv(path[0]), geometry.nearest(first))] * 2
-    assert not geometry.movers(geometry.compare(second, np.linalg.inv(path[15]), references)).any()
+    references = [ReferenceDepth(np.linalg.inv(path[0]), geometry.min_depth_grid(first))] * 2
+    assert not geometry.find_moving(
+        geometry.compare(second, np.linalg.inv(path[15]), references)
+    ).any()
 
 
 @given(st.floats(0, 319), st.floats(0, 239))
@@ -193,7 +198,7 @@ def test_three_centimetres_tell_it_in_nearly_every_world() -> None:
     found = 0
     for seed in range(200):
         points, seen, cart = scene(seed, 0.03)
-        moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(340, 9))[2]
+        moving = estimate_static_pose(STILL, points, seen, REPROJECTION, np.full(340, 9))[2]
         assert moving[~cart].mean() < 0.02
         found += moving[cart].mean() > 0.9
     assert found >= 198
@@ -207,7 +212,7 @@ def test_a_near_thing_that_rolls_a_little_is_told_from_the_world(seed: int, shif
         "the cart takes the pose along, and further than it went"
     )
     assert inlier[~cart].mean() > 0.8, "and no residual shows it"
-    pose, inlier, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(340, 9))
+    pose, inlier, moving = estimate_static_pose(STILL, points, seen, REPROJECTION, np.full(340, 9))
     assert moving[cart].mean() > 0.9
     assert moving[~cart].mean() < 0.02
     assert not (inlier & moving).any()
@@ -223,7 +228,7 @@ def test_nine_near_points_do_not_take_the_pose_along(seed: int, shift: float) ->
     points, seen, cart = points[:309], seen.take(np.arange(309)), cart[:309]
     dragged, _ = optimize_pose(STILL, points, seen, REPROJECTION)
     assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift
-    pose, _, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(309, 9))
+    pose, _, moving = estimate_static_pose(STILL, points, seen, REPROJECTION, np.full(309, 9))
     assert moving[cart].mean() > 0.8
     assert np.linalg.norm(pose[:3, 3]) < 0.015
 
@@ -232,7 +237,7 @@ def test_nine_near_points_do_not_take_the_pose_along(seed: int, shift: float) ->
 def test_a_world_that_stands_still_has_no_group_that_moves(seed: int) -> None:
     points, seen, _ = scene(seed, 0.0)
     pose, _ = optimize_pose(STILL, points, seen, REPROJECTION)
-    assert not moving_group(pose, points, seen, REPROJECTION, np.full(340, 9)).any()
+    assert not find_moving_cluster(pose, points, seen, REPROJECTION, np.full(340, 9)).any()
 
 
 @given(st.integers(0, 10_000), st.floats(0.06, 0.09))
@@ -252,10 +257,12 @@ def test_of_two_groups_the_one_that_is_long_known_is_the_world(seed: int, shift:
     )
     dragged, _ = optimize_pose(STILL, points, seen, REPROJECTION)
     assert np.linalg.norm(dragged[:3, 3]) > 0.5 * shift, "most points are the person's"
-    pose, _, moving = pose_of_rest(STILL, points, seen, REPROJECTION, np.where(walks, 5, 100))
+    pose, _, moving = estimate_static_pose(
+        STILL, points, seen, REPROJECTION, np.where(walks, 5, 100)
+    )
     assert np.linalg.norm(pose[:3, 3]) < 0.5 * shift
     assert moving[walks].mean() > 0.9
-    followed, _, _ = pose_of_rest(STILL, points, seen, REPROJECTION, np.full(400, 5))
+    followed, _, _ = estimate_static_pose(STILL, points, seen, REPROJECTION, np.full(400, 5))
     assert np.linalg.norm(followed[:3, 3]) > 0.5 * shift, (
         "of points that are as long known the most are the world"
     )
@@ -263,7 +270,7 @@ def test_of_two_groups_the_one_that_is_long_known_is_the_world(seed: int, shift:
 
 def test_few_points_are_not_judged() -> None:
     points, seen, _ = scene(0, 0.02)
-    assert not moving_group(
+    assert not find_moving_cluster(
         STILL, points[-20:], seen.take(np.arange(320, 340)), REPROJECTION, np.full(20, 9)
     ).any()
 

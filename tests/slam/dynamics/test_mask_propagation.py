@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 from plane_world import texture
 
 from cohdc_train.slam.dynamics.mask_propagation import (
-    Half,
+    HalfResFrame,
     Mask,
-    Propagation,
+    MaskPropagator,
     cut_by_depth,
-    halve,
-    halve_mask,
+    downsample,
+    downsample_mask,
 )
 
 HEIGHT, WIDTH = 240, 320
@@ -20,7 +20,7 @@ _WALLPAPER = texture(np.random.default_rng(1), HEIGHT, WIDTH)
 _SHIRT = texture(np.random.default_rng(2), 100, 80, patches=200)
 
 
-def scene(left: int, depth: float = PERSON) -> tuple[Half, Mask]:
+def scene(left: int, depth: float = PERSON) -> tuple[HalfResFrame, Mask]:
     """A textured board, 80 x 100 px, its left edge at `left`, before a wall. Returns the frame and
     the true mask.
     """
@@ -30,7 +30,7 @@ def scene(left: int, depth: float = PERSON) -> tuple[Half, Mask]:
     rgb[70:170, begin:end] = _SHIRT[:, begin - left : end - left]
     meters[70:170, begin:end] = depth
     mask[70:170, begin:end] = True
-    return halve(rgb, meters), halve_mask(mask)
+    return downsample(rgb, meters), downsample_mask(mask)
 
 
 def iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
@@ -38,9 +38,9 @@ def iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
 
 
 def test_a_mask_follows_the_square_it_was_made_for() -> None:
-    propagation = Propagation()
+    propagation = MaskPropagator()
     frame, mask = scene(100)
-    propagation.renew(mask, propagation.advance(frame), frame)
+    propagation.update(mask, propagation.advance(frame), frame)
     for step in range(1, 7):
         frame, truth = scene(100 + 6 * step)
         propagation.advance(frame)
@@ -51,26 +51,26 @@ def test_a_mask_follows_the_square_it_was_made_for() -> None:
 
 
 def test_a_late_mask_is_carried_through_the_frames_that_passed() -> None:
-    propagation = Propagation()
+    propagation = MaskPropagator()
     first, mask = scene(100)
     number = propagation.advance(first)
     for step in range(1, 7):
         frame, truth = scene(100 + 6 * step)
         propagation.advance(frame)
     assert propagation.mask() is None, "nothing is known before the first mask"
-    propagation.renew(mask, number, first)
+    propagation.update(mask, number, first)
     carried = propagation.mask()
     assert carried is not None
     assert iou(carried, truth) > 0.95
 
 
 def test_a_mask_older_than_the_memory_takes_one_leap() -> None:
-    propagation = Propagation()
+    propagation = MaskPropagator()
     first, mask = scene(100)
     number = propagation.advance(first)
     for _ in range(60):
         propagation.advance(scene(112)[0])
-    propagation.renew(mask, number, first)
+    propagation.update(mask, number, first)
     carried = propagation.mask()
     assert carried is not None
     assert iou(carried, scene(112)[1]) > 0.95
@@ -78,9 +78,9 @@ def test_a_mask_older_than_the_memory_takes_one_leap() -> None:
 
 
 def test_a_person_cut_by_the_border_walks_in_masked() -> None:
-    propagation = Propagation()
+    propagation = MaskPropagator()
     frame, mask = scene(-40)
-    propagation.renew(mask, propagation.advance(frame), frame)
+    propagation.update(mask, propagation.advance(frame), frame)
     for left in range(-36, 1, 4):
         frame, truth = scene(left)
         propagation.advance(frame)
@@ -90,9 +90,9 @@ def test_a_person_cut_by_the_border_walks_in_masked() -> None:
 
 
 def test_the_depth_gate_lets_go_what_is_not_as_deep_any_more() -> None:
-    propagation = Propagation()
+    propagation = MaskPropagator()
     frame, mask = scene(100)
-    propagation.renew(mask, propagation.advance(frame), frame)
+    propagation.update(mask, propagation.advance(frame), frame)
     propagation.advance(scene(100, depth=PERSON + 0.2)[0])
     kept = propagation.mask()
     assert kept is not None

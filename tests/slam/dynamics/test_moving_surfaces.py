@@ -14,7 +14,12 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cohdc_train.slam.dynamics.moving_surfaces import JUMP, Bits, MovingSurfaceTracker, surfaces
+from cohdc_train.slam.dynamics.moving_surfaces import (
+    JUMP,
+    Bits,
+    MovingSurfaceTracker,
+    label_surfaces,
+)
 from cohdc_train.slam.geometry.se3 import exp_se3
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
@@ -42,80 +47,80 @@ def scene(person: Bits = PERSON, depth: float = 1.0) -> NDArray[np.float32]:
 
 def test_of_a_surface_that_is_found_by_half_all_moves_and_nothing_else() -> None:
     np.testing.assert_array_equal(
-        MovingSurfaceTracker().whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON
+        MovingSurfaceTracker().update(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON
     )
 
 
 def test_of_one_that_is_found_by_less_or_was_just_seen_there_only_that_moves() -> None:
     np.testing.assert_array_equal(
-        MovingSurfaceTracker().whole(0.0, THIRD, NOWHERE, NOWHERE, scene(), NOWHERE), THIRD
+        MovingSurfaceTracker().update(0.0, THIRD, NOWHERE, NOWHERE, scene(), NOWHERE), THIRD
     )
     np.testing.assert_array_equal(
-        MovingSurfaceTracker().whole(0.0, HALF, HALF, NOWHERE, scene(), NOWHERE), HALF
+        MovingSurfaceTracker().update(0.0, HALF, HALF, NOWHERE, scene(), NOWHERE), HALF
     )
 
 
 def test_what_moved_goes_on_though_nothing_finds_it_until_it_was_seen_at_rest() -> None:
     movers = MovingSurfaceTracker()
-    movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.update(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
     for step in range(1, 6):
         image = scene(np.roll(PERSON, step, axis=1), 1.0 - 0.1 * step)
-        moved = movers.whole(0.0, NOWHERE, EVERYWHERE & (image > 2), NOWHERE, image, NOWHERE)
+        moved = movers.update(0.0, NOWHERE, EVERYWHERE & (image > 2), NOWHERE, image, NOWHERE)
         np.testing.assert_array_equal(moved, image < 2)
     there = image < 2
     np.testing.assert_array_equal(
-        movers.whole(0.0, NOWHERE, EVERYWHERE, NOWHERE, image, NOWHERE), there
+        movers.update(0.0, NOWHERE, EVERYWHERE, NOWHERE, image, NOWHERE), there
     )
-    assert not movers.whole(0.0, NOWHERE, EVERYWHERE, EVERYWHERE, image, NOWHERE).any()
+    assert not movers.update(0.0, NOWHERE, EVERYWHERE, EVERYWHERE, image, NOWHERE).any()
 
 
 def test_what_nothing_finds_nor_masks_goes_on_for_half_a_second() -> None:
     movers, trace = MovingSurfaceTracker(), block(slice(10, 12), slice(10, 14))
-    movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.update(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
     for t in (0.4, 0.8, 1.2):
         np.testing.assert_array_equal(
-            movers.whole(t, trace, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON
+            movers.update(t, trace, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON
         )
     np.testing.assert_array_equal(
-        movers.whole(1.6, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON
+        movers.update(1.6, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON
     )
-    assert not movers.whole(2.0, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE).any()
+    assert not movers.update(2.0, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE).any()
 
 
 def test_a_frame_without_depth_says_nothing() -> None:
     movers = MovingSurfaceTracker()
-    movers.whole(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
-    assert not movers.whole(0.1, NOWHERE, NOWHERE, NOWHERE, scene() * 0, NOWHERE).any()
+    movers.update(0.0, HALF, NOWHERE, NOWHERE, scene(), NOWHERE)
+    assert not movers.update(0.1, NOWHERE, NOWHERE, NOWHERE, scene() * 0, NOWHERE).any()
     np.testing.assert_array_equal(
-        movers.whole(0.2, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON
+        movers.update(0.2, NOWHERE, EVERYWHERE, NOWHERE, scene(), NOWHERE), PERSON
     )
 
 
 def test_a_mask_of_one_frame_is_not_remembered() -> None:
     movers, wall = MovingSurfaceTracker(), block(slice(0, 30), slice(5, 35))
-    movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE)
-    movers.whole(0.1, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), wall)
-    assert not movers.whole(0.2, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE).any()
+    movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE)
+    movers.update(0.1, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), wall)
+    assert not movers.update(0.2, NOWHERE, NOWHERE, NOWHERE, scene(NOWHERE), NOWHERE).any()
 
 
 def test_who_comes_after_in_the_same_place_does_not_move_for_it() -> None:
     movers = MovingSurfaceTracker()
-    movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
-    assert not movers.whole(
+    movers.update(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
+    assert not movers.update(
         0.0, NOWHERE, NOWHERE, NOWHERE, scene(depth=1.0 + 2 * JUMP), NOWHERE
     ).any()
 
 
 def test_whom_a_mask_covered_goes_on_where_the_next_one_misses_him() -> None:
     movers, wide = MovingSurfaceTracker(), block(slice(7, 28), slice(7, 23))
-    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), wide).any(), (
+    assert not movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), wide).any(), (
         "he is in the mask already"
     )
     np.testing.assert_array_equal(
-        movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), PERSON & ~THIRD
+        movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), THIRD), PERSON & ~THIRD
     )
     np.testing.assert_array_equal(
-        movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON
+        movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE), PERSON
     )
 
 
@@ -126,7 +131,7 @@ def test_a_wall_that_comes_out_from_under_the_edge_of_a_mask_stands_still() -> N
         person, wide = (
             block(slice(0, 30), slice(max(step - more, 0), step + 10 + more)) for more in (0, 3)
         )
-        assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(person), wide).any()
+        assert not movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(person), wide).any()
 
 
 def test_a_floor_is_no_part_of_who_is_masked_on_it() -> None:
@@ -134,16 +139,16 @@ def test_a_floor_is_no_part_of_who_is_masked_on_it() -> None:
     found = PERSON | block(slice(25, 28), slice(0, 10))
     wanted = found & ~PERSON
     np.testing.assert_array_equal(
-        MovingSurfaceTracker().whole(0.0, found, NOWHERE, NOWHERE, scene(PERSON | floor), PERSON),
+        MovingSurfaceTracker().update(0.0, found, NOWHERE, NOWHERE, scene(PERSON | floor), PERSON),
         wanted,
     )
 
 
 def test_what_is_forgotten_moves_no_longer() -> None:
     movers = MovingSurfaceTracker()
-    movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
-    movers.forget()
-    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
+    movers.update(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.reset()
+    assert not movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
 
 
 def test_the_floor_that_feet_stand_on_is_not_taken_along() -> None:
@@ -151,25 +156,25 @@ def test_the_floor_that_feet_stand_on_is_not_taken_along() -> None:
     comes into view.
     """
     movers, floor = MovingSurfaceTracker(), block(slice(25, 28), slice(0, 40))
-    movers.whole(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
+    movers.update(0.0, PERSON, NOWHERE, NOWHERE, scene(), NOWHERE)
     image = scene(PERSON | floor)
     seen = floor.copy()
     seen[:, 35:] = False
     np.testing.assert_array_equal(
-        movers.whole(0.0, NOWHERE, seen, NOWHERE, image, NOWHERE), PERSON | (floor & ~seen)
+        movers.update(0.0, NOWHERE, seen, NOWHERE, image, NOWHERE), PERSON | (floor & ~seen)
     )
 
 
 def test_where_everything_seems_to_move_the_pose_is_wrong_and_nothing_does() -> None:
     movers = MovingSurfaceTracker()
-    assert not movers.whole(0.0, EVERYWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
-    assert not movers.whole(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any(), "nor later"
+    assert not movers.update(0.0, EVERYWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any()
+    assert not movers.update(0.0, NOWHERE, NOWHERE, NOWHERE, scene(), NOWHERE).any(), "nor later"
 
 
 def test_where_nothing_is_known_nothing_moves() -> None:
     assert (
         not MovingSurfaceTracker()
-        .whole(0.0, NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32), NOWHERE)
+        .update(0.0, NOWHERE, NOWHERE, NOWHERE, np.zeros(SHAPE, dtype=np.float32), NOWHERE)
         .any()
     )
 
@@ -193,7 +198,7 @@ def test_surfaces_are_what_is_joined_without_a_jump(image: NDArray[np.float32]) 
         (np.ones(joined.sum()), (first[joined], second[joined])), (image.size, image.size)
     )
     _, wanted = connected_components(links, directed=False)
-    labels = surfaces(image).ravel()
+    labels = label_surfaces(image).ravel()
     np.testing.assert_array_equal(labels > 0, depth > 0)
     known = depth > 0
     same = labels[known][:, None] == labels[known][None]

@@ -13,7 +13,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.segmenter import Detections
 from cohdc_train.slam.config import Culling
 from cohdc_train.slam.dynamics.mask_sources import dynamic_mask
-from cohdc_train.slam.dynamics.masks import grow
+from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.features.depth_sampling import sample_depth
 from cohdc_train.slam.features.descriptors import hamming
 from cohdc_train.slam.features.keypoints import Features
@@ -165,7 +165,7 @@ def test_grow_looks_at_a_window_and_gives_what_the_whole_image_would(
     for row, column in zip(rng.integers(0, 60, 3), rng.integers(0, 80, 3), strict=True):
         mask[row : row + 7, column : column + 4] = True
     whole = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= radius
-    assert np.array_equal(grow(mask, radius), whole)
+    assert np.array_equal(dilate_mask(mask, radius), whole)
 
 
 def test_grow_is_a_disc() -> None:
@@ -173,10 +173,10 @@ def test_grow_is_a_disc() -> None:
     mask[20, 20] = True
     v, u = np.mgrid[:41, :41]
     exact = np.hypot(u - 20, v - 20)
-    grown = grow(mask, 8.0)
+    grown = dilate_mask(mask, 8.0)
     assert grown[exact < 7.5].all()
     assert not grown[exact > 8.5].any()
-    assert grow(mask, 0.0).sum() == 1
+    assert dilate_mask(mask, 0.0).sum() == 1
 
 
 @pytest.mark.parametrize(

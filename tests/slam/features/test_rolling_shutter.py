@@ -11,7 +11,7 @@ from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.rolling_shutter import undo_rolling_shutter
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 
-ROLLING = replace(CAMERA, readout=0.02)
+ROLLING = replace(CAMERA, readout_s=0.02)
 speeds = st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6)
 
 
@@ -26,7 +26,7 @@ def seen(points: Array, twist: Array) -> Features:
             ]
         )
         pixels = CAMERA.project(local)
-        late = ROLLING.readout * (pixels[:, 1] / CAMERA.height - 0.5)
+        late = ROLLING.readout_s * (pixels[:, 1] / CAMERA.height - 0.5)
     return features_at(pixels, local[:, 2])
 
 

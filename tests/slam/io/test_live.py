@@ -20,10 +20,10 @@ from plane_world import CAMERA, camera_path, render, room, write_sequence
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.frame import View
-from cohdc_train.slam.io.growing_sequence import Followed
-from cohdc_train.slam.io.live import Live
-from cohdc_train.slam.io.sources import rgbd_layout
-from cohdc_train.slam.io.tum import Entry
+from cohdc_train.slam.io.growing_sequence import GrowingSequence
+from cohdc_train.slam.io.live import LiveCamera
+from cohdc_train.slam.io.sources import rgbd_format
+from cohdc_train.slam.io.tum import TimestampedImage
 from cohdc_train.slam.run import run_source, slam
 
 FRAMES = 12
@@ -89,19 +89,19 @@ def test_a_folder_that_grows_gives_what_the_whole_folder_gives(
 
 
 def followed(folder: Path, idle: float = 0.2) -> list[View]:
-    return list(Followed(folder, CAMERA, rgbd_layout(CAMERA), idle))
+    return list(GrowingSequence(folder, CAMERA, rgbd_format(CAMERA), idle))
 
 
 def test_silence_ends_it_and_what_has_no_partner_is_counted(recorded: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(recorded, tmp_path / "room"))
     lines = (folder / "depth.txt").read_text().splitlines()
     (folder / "depth.txt").write_text("\n".join(line for i, line in enumerate(lines) if i != 4))
-    source = Followed(folder, CAMERA, rgbd_layout(CAMERA), 0.2)
+    source = GrowingSequence(folder, CAMERA, rgbd_format(CAMERA), 0.2)
     start = time.monotonic()
     views = list(source)
     assert 0.2 <= time.monotonic() - start < 5
     assert len(views) == FRAMES - 1
-    assert source.without_depth == 1
+    assert source.num_unpaired == 1
     np.testing.assert_allclose(np.diff([view.t for view in views]).max(), 2 / 30, atol=1e-5)
 
 
@@ -130,7 +130,7 @@ def test_a_camera_may_fill_one_buffer_again_and_again() -> None:
             buffer[:] = k
             yield buffer, np.zeros(buffer.shape[:2], np.float32), float(k)
 
-    assert [int(view.rgb[0, 0, 0]) for view in list(Live(CAMERA, frames()))] == [0, 1, 2]
+    assert [int(view.rgb[0, 0, 0]) for view in list(LiveCamera(CAMERA, frames()))] == [0, 1, 2]
 
 
 def test_a_broken_line_or_image_later_on_is_told_and_left_out(
@@ -171,14 +171,14 @@ def test_the_nearest_partner_is_taken_once(tmp_path: Path) -> None:
         for t in stamps:
             (tmp_path / f"{t:.3f}.dat").write_bytes(b"anything")
     (tmp_path / "done").touch()
-    layout, pairs = rgbd_layout(CAMERA), []
+    layout, pairs = rgbd_format(CAMERA), []
 
-    def view(first: Entry, second: Entry) -> View:
+    def view(first: TimestampedImage, second: TimestampedImage) -> View:
         pairs.append((first.t, second.t))
         return View(first.t, "", "", np.zeros((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32))
 
     list(
-        Followed(
+        GrowingSequence(
             tmp_path,
             CAMERA,
             type(layout)(layout.first, layout.second, layout.max_difference, view),
@@ -198,7 +198,7 @@ def frames(count: int) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float32],
 def test_a_camera_of_ones_own(tmp_path: Path) -> None:
     seen = []
     metrics = run_source(
-        Live(CAMERA, frames(FRAMES)),
+        LiveCamera(CAMERA, frames(FRAMES)),
         out=tmp_path / "run",
         features=400,
         observers=[
@@ -272,7 +272,7 @@ def test_a_camera_that_gives_something_else(tmp_path: Path, change: object, said
     assert callable(change)
     altered = (change(*frame) for frame in frames(2))
     with pytest.raises(DataError, match=said):
-        list(Live(CAMERA, altered))
+        list(LiveCamera(CAMERA, altered))
 
 
 def test_what_a_live_run_has_is_written_when_its_camera_fails(
@@ -282,7 +282,9 @@ def test_what_a_live_run_has_is_written_when_its_camera_fails(
         yield from frames(4)
         raise DataError("the cable is out")
 
-    assert run_source(Live(CAMERA, failing()), out=tmp_path / "run", features=400)["frames"] == 4
+    assert (
+        run_source(LiveCamera(CAMERA, failing()), out=tmp_path / "run", features=400)["frames"] == 4
+    )
     assert "ended: the cable is out" in capsys.readouterr().err
     assert (tmp_path / "run" / "map.ply").exists()
 
@@ -298,7 +300,7 @@ def test_ctrl_c_ends_a_live_run_after_the_frame(
             signal.raise_signal(signal.SIGINT)
 
     metrics = run_source(
-        Live(CAMERA, frames(1000)), out=tmp_path / "run", features=400, observers=[interrupt]
+        LiveCamera(CAMERA, frames(1000)), out=tmp_path / "run", features=400, observers=[interrupt]
     )
     assert metrics["frames"] == len(seen) == 3
     assert "stopping; Ctrl-C again" in capsys.readouterr().err
@@ -314,6 +316,6 @@ def test_ctrl_c_ends_the_wait_for_more(recorded: Path, tmp_path: Path) -> None:
         if len(seen) == FRAMES:
             threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
 
-    source = Followed(recorded, CAMERA, rgbd_layout(CAMERA), idle=600)
+    source = GrowingSequence(recorded, CAMERA, rgbd_format(CAMERA), idle=600)
     metrics = run_source(source, out=tmp_path / "run", features=400, observers=[interrupt_later])
     assert metrics["frames"] == FRAMES

@@ -19,7 +19,14 @@ from tool_loader import load_tool
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
+from cohdc_train.slam.io.ros import (
+    camera_from_message,
+    depth_from_message,
+    fill_mask,
+    fill_pose,
+    rgb_from_message,
+    to_seconds,
+)
 from cohdc_train.trajectory.trajectory import read_tum
 
 FRAMES = 8
@@ -57,9 +64,9 @@ def test_colour_encodings(rgb: NDArray[np.uint8], padding: int) -> None:
     }
     for encoding, pixels in messages.items():
         np.testing.assert_array_equal(
-            rgb_of(image(encoding, pixels, padding)), rgb, err_msg=encoding
+            rgb_from_message(image(encoding, pixels, padding)), rgb, err_msg=encoding
         )
-    gray = rgb_of(image("mono8", rgb[..., 0], padding))
+    gray = rgb_from_message(image("mono8", rgb[..., 0], padding))
     np.testing.assert_array_equal(gray, np.repeat(rgb[..., :1], 3, axis=2))
 
 
@@ -69,20 +76,20 @@ def test_depth_encodings(big: bool) -> None:
     millimetres = np.array([[0, 1234, 2500], [0, 0, 4000]], np.uint16)
     expected = np.array([[0, 1.234, 2.5], [0, 0, 4]], np.float32)
     for message in (image("32FC1", meters, 8, big), image("16UC1", millimetres, 2, big)):
-        depth = depth_of(message)
+        depth = depth_from_message(message)
         assert depth.dtype == np.float32
         np.testing.assert_allclose(depth, expected, rtol=1e-6)
 
 
 def test_messages_that_cannot_be_used_are_named(rgb: NDArray[np.uint8]) -> None:
     with pytest.raises(DataError, match="encoding 'yuv422' is not one of rgb8 bgr8"):
-        rgb_of(image("yuv422", rgb))
+        rgb_from_message(image("yuv422", rgb))
     with pytest.raises(DataError, match="encoding 'rgb8' is not one of 16UC1"):
-        depth_of(image("rgb8", rgb))
+        depth_from_message(image("rgb8", rgb))
     short = image("rgb8", rgb)
     short.data = short.data[:-1]
     with pytest.raises(DataError, match="161 bytes are too few for 9x6 rgb8 of step 27"):
-        rgb_of(short)
+        rgb_from_message(short)
 
 
 def info(**changes: Any) -> SimpleNamespace:
@@ -98,20 +105,22 @@ def info(**changes: Any) -> SimpleNamespace:
 
 
 def test_camera_info() -> None:
-    plain = camera_of(info())
+    plain = camera_from_message(info())
     assert plain == Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1000.0)
-    bent = camera_of(info(d=[0.1, -0.2, 0.001, 0.002, 0.3]))
+    bent = camera_from_message(info(d=[0.1, -0.2, 0.001, 0.002, 0.3]))
     assert (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3) == (0.1, -0.2, 0.001, 0.002, 0.3)
     assert (
-        camera_of(info(d=[0.1, 0, 0, 0, 0, 0, 0, 0], distortion_model="rational_polynomial")).k1
+        camera_from_message(
+            info(d=[0.1, 0, 0, 0, 0, 0, 0, 0], distortion_model="rational_polynomial")
+        ).k1
         == 0.1
     )
     with pytest.raises(DataError, match="'equidistant' of 4 coefficients"):
-        camera_of(info(d=[0.1] * 4, distortion_model="equidistant"))
+        camera_from_message(info(d=[0.1] * 4, distortion_model="equidistant"))
     with pytest.raises(DataError, match="of 8 coefficients"):
-        camera_of(info(d=[0.1] * 8, distortion_model="rational_polynomial"))
+        camera_from_message(info(d=[0.1] * 8, distortion_model="rational_polynomial"))
     with pytest.raises(DataError, match="not calibrated, fx is 0"):
-        camera_of(info(k=[0] * 9))
+        camera_from_message(info(k=[0] * 9))
 
 
 def pose_message() -> SimpleNamespace:
@@ -137,12 +146,12 @@ def test_a_mask_goes_out_and_comes_back() -> None:
     mask = np.random.default_rng(1).random((5, 7)) < 0.5
     message = SimpleNamespace()
     fill_mask(message, mask)
-    np.testing.assert_array_equal(rgb_of(message)[..., 0] > 0, mask)
+    np.testing.assert_array_equal(rgb_from_message(message)[..., 0] > 0, mask)
     assert set(message.data) == {0, 255}
 
 
 def test_seconds() -> None:
-    assert seconds(SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000)) == 1_700_000_000.25
+    assert to_seconds(SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000)) == 1_700_000_000.25
 
 
 # ---- the node

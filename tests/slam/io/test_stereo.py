@@ -17,8 +17,8 @@ from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.calibration import load_camera
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Recorded
-from cohdc_train.slam.io.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_layout
+from cohdc_train.slam.io.sources import RecordedSequence
+from cohdc_train.slam.io.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_format
 
 BASELINE = 0.12
 PAIR = Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1.0, baseline=BASELINE)
@@ -119,8 +119,8 @@ def test_a_stereo_sequence_is_tracked(tmp_path: Path) -> None:
 def test_a_camera_with_a_baseline_needs_no_depth_scale(tmp_path: Path) -> None:
     (tmp_path / "camera.yaml").write_text(STEREO_YAML)
     assert load_camera(tmp_path / "camera.yaml") == PAIR
-    assert CAMERA.far == 5.0
-    assert PAIR.far == pytest.approx(4.8)
+    assert CAMERA.max_depth_m == 5.0
+    assert PAIR.max_depth_m == pytest.approx(4.8)
 
 
 @pytest.mark.parametrize(
@@ -155,4 +155,4 @@ def test_pairs_that_are_not_simultaneous_are_none(tmp_path: Path) -> None:
     with pytest.raises(
         DataError, match=r"pair: no image of left\.txt lies within 0\.005 s of one of right\.txt"
     ):
-        Recorded(sequence, PAIR, stereo_layout(PAIR))
+        RecordedSequence(sequence, PAIR, stereo_format(PAIR))

@@ -26,7 +26,7 @@ def test_nearest_association_one_to_one(tmp_path: Path) -> None:
     sequence = read_sequence(folder(tmp_path, [1.000, 1.030, 1.060, 2.0], [1.005, 1.028, 1.034]))
     pairs = [(frame.stamp, frame.depth.stem) for frame in sequence.frames]
     assert pairs == [("1.000", "1.005"), ("1.030", "1.028")]
-    assert sequence.without_depth == 2
+    assert sequence.num_unpaired == 2
     assert sequence.groundtruth is None
 
 

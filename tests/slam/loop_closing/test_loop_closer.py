@@ -11,7 +11,7 @@ from cohdc_train.slam.config import Method
 from cohdc_train.slam.frame import Pose
 from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
-from cohdc_train.slam.loop_closing.verification import Loop, LoopVerifier
+from cohdc_train.slam.loop_closing.verification import LoopConstraint, LoopVerifier
 from cohdc_train.slam.mapping.global_bundle_adjustment import adjust_everything
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
@@ -152,7 +152,7 @@ class TestVerification:
             for k in drifting[0].map.keyframes
         }
 
-    def verify(self, tracker: Tracker, pictures: dict[int, DepthImage]) -> Loop | None:
+    def verify(self, tracker: Tracker, pictures: dict[int, DepthImage]) -> LoopConstraint | None:
         newest = tracker.map.keyframes[-1]
         there = np.linalg.norm(TRUTH[:, :3, 3] - TRUTH[frame(newest), :3, 3], axis=1)
         old = min(tracker.map.keyframes[:20], key=lambda k: float(there[frame(k)]))

@@ -11,7 +11,7 @@ from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
-from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognition
+from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognizer
 from cohdc_train.slam.optimization.image_alignment import align, warp_jacobian
 
 Array = NDArray[np.float64]
@@ -122,17 +122,17 @@ def test_a_picture_keeps_the_geometry(size: tuple[int, int]) -> None:
 def test_a_place_is_recognised_among_others() -> None:
     rng, extract = np.random.default_rng(0), OrbExtractor(CAMERA, 300)
     poses = way_round(24, turns=0.95)
-    places = PlaceRecognition()
+    places = PlaceRecognizer()
     for number, pose in enumerate(poses):
         places.add(number, extract(*poor_view(pose, rng)).descriptors)
     nudge = exp_se3(np.array([0.05, 0.02, -0.05, 0.01, 0.03, 0.02]))
     for index in (3, 20):
-        likeness = places.likeness(extract(*poor_view(poses[index] @ nudge, rng)).descriptors)
-        assert likeness.shape == (24,)
-        assert np.argmax(likeness) == index
-        apart = np.delete(likeness, range(max(index - 3, 0), index + 4))
-        assert likeness[index] > 3 * apart.max()
+        similarity = places.similarity(extract(*poor_view(poses[index] @ nudge, rng)).descriptors)
+        assert similarity.shape == (24,)
+        assert np.argmax(similarity) == index
+        apart = np.delete(similarity, range(max(index - 3, 0), index + 4))
+        assert similarity[index] > 3 * apart.max()
     for number in range(3):
         places.remove(number)
     there = extract(*poor_view(poses[20] @ nudge, rng)).descriptors
-    assert np.argmax(places.likeness(there)) == 17, "the others move up, as the map's do"
+    assert np.argmax(places.similarity(there)) == 17, "the others move up, as the map's do"

@@ -52,7 +52,7 @@ def view(index: int) -> View:
 class Gated:
     """A source that makes a view when it is let; `asked` tells how many views have been asked for."""
 
-    camera, groundtruth, without_depth = CAMERA, None, 0
+    camera, groundtruth, num_unpaired = CAMERA, None, 0
 
     def __init__(self, count: int, broken: int | None = None) -> None:
         self.count, self.broken = count, broken
@@ -99,20 +99,20 @@ class Still:
 def test_an_answer_ends_the_latency_and_the_time_until_the_next_view_is_spent() -> None:
     source, clock = Gated(3), Still()
     source.allowed.release(2)
-    spent = []
+    frame_time_used = []
     with PacedSource(source, clock) as paced:
         for taken in paced:
-            assert paced.spent() <= 0
+            assert paced.frame_time_used() <= 0
             if taken.name == "1":
                 source.let(1)
             if taken.name == "2":
                 clock.time = 2.2 / 30
-                paced.answered()
+                paced.mark_answered()
                 for moment in (2.45, 2.55):
                     clock.time = moment / 30
-                    spent.append(paced.spent())
+                    frame_time_used.append(paced.frame_time_used())
                 source.allowed.release()
-    np.testing.assert_allclose(spent, [0.45, 0.55])
+    np.testing.assert_allclose(frame_time_used, [0.45, 0.55])
     np.testing.assert_allclose(
         paced.latencies, [-1 / 30, 0.2 / 30], atol=1e-9
     )  # the clock stood still for the first
@@ -141,7 +141,7 @@ def test_views_that_come_while_the_tracker_is_busy_are_dropped_and_counted() -> 
 class SlowToRead:
     """Four views that take 0.1 s each to make."""
 
-    camera, groundtruth, without_depth = CAMERA, None, 0
+    camera, groundtruth, num_unpaired = CAMERA, None, 0
 
     def __init__(self, clock: Still) -> None:
         self.clock = clock
@@ -159,7 +159,7 @@ def test_reading_slower_than_the_recording_delays_it_instead_of_piling_up() -> N
     clock = Still()
     with PacedSource(SlowToRead(clock), clock) as paced:
         given = list(paced)
-    assert paced.behind == pytest.approx(3 * (0.1 - 1 / 30))
+    assert paced.playback_delay_s == pytest.approx(3 * (0.1 - 1 / 30))
     np.testing.assert_allclose(clock.waits, [0.2, 0.3, 0.4])
     assert len(given) + paced.dropped == 4
 

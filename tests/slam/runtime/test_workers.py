@@ -20,12 +20,12 @@ from threadpoolctl import threadpool_info
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import Method
-from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, halve_mask
+from cohdc_train.slam.dynamics.mask_propagation import PropagatedMask, downsample_mask
 from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.se3 import exp_se3, to_local
 from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, close_window, open_window
-from cohdc_train.slam.runtime.async_masks import AsyncMasks
+from cohdc_train.slam.runtime.async_masks import AsyncSegmenter
 from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
@@ -50,8 +50,8 @@ def view(index: int, rgb: np.ndarray | None = None, depth: np.ndarray | None = N
 class Segmenter:
     """Takes as long as it is told to: it holds a frame until `finish`."""
 
-    def __init__(self, outline: Callable[[View], Mask]) -> None:
-        self.outline = outline
+    def __init__(self, segment: Callable[[View], Mask]) -> None:
+        self.segment = segment
         self.allowed = threading.Semaphore(0)
         self.begun: list[str] = []
         self.changed = threading.Condition()
@@ -61,14 +61,14 @@ class Segmenter:
             self.begun.append(view.name)
             self.changed.notify_all()
         assert self.allowed.acquire(timeout=LONG)
-        return self.outline(view), 7.0
+        return self.segment(view), 7.0
 
     def wait_for(self, count: int) -> None:
         with self.changed:
             assert self.changed.wait_for(lambda: len(self.begun) >= count, LONG)
 
 
-def wait_for_result(masks: AsyncMasks) -> None:
+def wait_for_result(masks: AsyncSegmenter) -> None:
     """Until the worker has handed over what it was allowed to finish."""
     end = time.monotonic() + LONG
     while masks._results._item is None:
@@ -83,7 +83,7 @@ def nothing_moves(view: View) -> Mask:
 def test_a_slow_segmenter_gets_the_newest_frame_and_no_queue() -> None:
     segmenter = Segmenter(nothing_moves)
     segmenter.allowed.release()
-    with AsyncMasks(segmenter) as masks:
+    with AsyncSegmenter(segmenter) as masks:
         masks(view(0))
         masks(view(1))
         segmenter.wait_for(2)
@@ -102,9 +102,9 @@ def test_a_mask_that_was_carried_on_is_as_wide_as_one_in_time() -> None:
     rgb, depth, _ = render(room(), camera_path(1)[0])
     box = np.zeros(depth.shape, dtype=np.bool_)
     box[40:80, 60:100] = True
-    carried = CarriedMasks()
+    carried = PropagatedMask()
     job = carried.advance(view(0, rgb, depth))
-    carried.renew(job, halve_mask(box), 10.0)
+    carried.update(job, downsample_mask(box), 10.0)
     in_time = carried.mask(job.view)
     assert in_time.sum() > 1.3 * box.sum(), "it has grown"
     for index in range(1, 8):
@@ -116,7 +116,7 @@ def test_what_the_segmenter_raises_is_raised_to_the_caller() -> None:
     def missing(view: View) -> tuple[Mask, float]:
         raise DataError(f"{view.name}.png: cannot be read")
 
-    with AsyncMasks(missing) as masks, pytest.raises(DataError, match=r"0\.png"):
+    with AsyncSegmenter(missing) as masks, pytest.raises(DataError, match=r"0\.png"):
         masks(view(0))
 
 
@@ -151,7 +151,7 @@ def run_late() -> tuple[Tracker, list[bool], list[float]]:
     tracker = Tracker(CAMERA, features=500, method=Method(global_adjustment=False), executor=Late())
     tracked, overlaps = [], []
     segmenter.allowed.release()
-    with AsyncMasks(segmenter) as masks:
+    with AsyncSegmenter(segmenter) as masks:
         for index, (rgb, depth, moving) in enumerate(rendered):
             if index and index % DELAY == 0:
                 segmenter.allowed.release()

@@ -17,9 +17,9 @@ from ply_reader import read_ply
 from cohdc_train.cli import main
 from cohdc_train.slam.io.ply import write_ply
 from cohdc_train.slam.run import slam
-from cohdc_train.slam.visualization.depth_fusion import fuse, sure, unmasked
-from cohdc_train.slam.visualization.point_cloud import Cloud
-from cohdc_train.slam.visualization.top_view import from_above
+from cohdc_train.slam.visualization.depth_fusion import filter_depth, fuse, remove_dynamic_depth
+from cohdc_train.slam.visualization.point_cloud import PointCloud
+from cohdc_train.slam.visualization.top_view import render_top_view
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 Points = NDArray[np.float64]
@@ -145,7 +145,7 @@ def test_depth_is_refused_beside_edges_masks_and_far_away() -> None:
     depth[:, 90:] = 6.0
     mask = np.zeros(depth.shape, np.bool_)
     mask[:, :10] = True
-    kept = sure(unmasked(depth, mask), CAMERA)[20] > 0
+    kept = filter_depth(remove_dynamic_depth(depth, mask), CAMERA)[20] > 0
     assert np.flatnonzero(kept).tolist() == [*range(10 + 1, 60 - 2), *range(60 + 2, 90 - 2)]
 
 
@@ -189,7 +189,7 @@ def test_memory_is_bounded_by_larger_cubes(points: Points) -> None:
 def test_seen_from_above_right_is_right_and_forward_is_up() -> None:
     places = np.array([[0, 1, 4.0], [2, 1, 2.0], [-2, 1, 2.0], [0, -3, 3.0]])
     colors = np.array([[0, 0, 255], [0, 255, 0], [1, 2, 3], [255, 0, 255]], dtype=np.uint8)
-    image = from_above(Cloud(places, colors), [np.eye(4)])
+    image = render_top_view(PointCloud(places, colors), [np.eye(4)])
 
     def place(color: list[int]) -> NDArray[np.float64]:
         return np.argwhere((image == color).all(axis=2)).mean(axis=0)
