@@ -16,7 +16,7 @@ from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameResult, PoseCallback, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import inverse
-from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
+from cohdc_train.slam.loop_closing.loop_closer import LoopCloser, LoopCloserConfig
 from cohdc_train.slam.mapping.frame_history import FrameHistory
 from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames
 from cohdc_train.slam.mapping.local_mapper import LocalMapper, LocalMapperConfig
@@ -161,9 +161,14 @@ class Slam:
         config = self.config
         loop_closer = None
         if config.loops.enabled:
-            loop_closer = LoopCloser(
-                self.map, self._reprojection, config.seed, config.bundle_adjustment
+            loop_config = LoopCloserConfig(
+                config.loops,
+                config.loop_verification,
+                config.matching,
+                config.ransac,
+                config.bundle_adjustment,
             )
+            loop_closer = LoopCloser(self.map, self._reprojection, loop_config, config.seed)
         mapper_config = LocalMapperConfig(
             config.bundle_adjustment,
             config.keyframe_culling,

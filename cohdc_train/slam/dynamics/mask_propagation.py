@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 
 Floats = NDArray[np.float32]
 
@@ -160,7 +160,7 @@ class SegmentationJob:
     """A frame that may be segmented. number: as MaskPropagator counts."""
 
     number: int
-    view: View
+    view: RGBDFrame
     half: HalfResFrame
 
 
@@ -176,7 +176,7 @@ class PropagatedMask:
         self._growth = 0.0
         self._propagation = MaskPropagator()
 
-    def advance(self, view: View) -> SegmentationJob:
+    def advance(self, view: RGBDFrame) -> SegmentationJob:
         """Go on to the next view."""
         half = downsample(view.rgb, view.depth)
         return SegmentationJob(self._propagation.advance(half), view, half)
@@ -188,7 +188,7 @@ class PropagatedMask:
         self.newest, self._growth = job, growth
         self._propagation.update(mask, job.number, job.half)
 
-    def mask(self, view: View) -> Mask:
+    def mask(self, view: RGBDFrame) -> Mask:
         """[H, W] bool, True = dynamic, for the view that was gone on to."""
         mask = self._propagation.mask()
         assert mask is not None

@@ -2,10 +2,19 @@
 is spread out.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from cohdc_train.slam.config import (
+    BundleAdjustmentConfig,
+    LoopConfig,
+    LoopVerificationConfig,
+    MatchingConfig,
+    RansacConfig,
+)
 from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.loop_closing.place_recognition import PlaceRecognizer
@@ -29,16 +38,36 @@ _SHARED = 100
 _TRUST = 0.3  # weight that the graph must leave to a new loop
 
 
+@dataclass(frozen=True)
+class LoopCloserConfig:
+    """Options of a loop closer."""
+
+    loops: LoopConfig = LoopConfig()
+    verification: LoopVerificationConfig = LoopVerificationConfig()
+    matching: MatchingConfig = MatchingConfig()
+    ransac: RansacConfig = RansacConfig()
+    bundle_adjustment: BundleAdjustmentConfig = BundleAdjustmentConfig()
+
+
 class LoopCloser:
     """Watches the keyframes of a map; `closed` counts the loops closed."""
 
-    def __init__(self, world: Map, reprojection: ReprojectionModel, seed: int = 0) -> None:
+    def __init__(
+        self,
+        world: Map,
+        reprojection: ReprojectionModel,
+        config: LoopCloserConfig = LoopCloserConfig(),
+        seed: int = 0,
+    ) -> None:
         self.closed = 0
         self._world, self._reprojection = world, reprojection
+        self._config = config
         self._places = PlaceRecognizer(seed)
         self._pictures: dict[int, DepthImage] = {}  # of the keyframes in the map, by index
         self._loops: list[LoopConstraint] = []
-        self._verify = LoopVerifier(world, reprojection, np.random.default_rng(seed))
+        self._verify = LoopVerifier(
+            world, reprojection, np.random.default_rng(seed), config.matching, config.ransac
+        )
 
     def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
         """Look for a loop with the newest keyframe of the map; every one must be given once, when
@@ -90,7 +119,7 @@ class LoopCloser:
         """Optimise the graph with the new loop and move the map, unless the graph refuses the loop."""
         edges = self._edges(loop)
         before = np.stack([k.T_cw for k in self._world.keyframes])
-        after, weights = optimize_graph(before, edges)
+        after, weights = optimize_graph(before, edges, self._config.loops)
         if weights[-len(loop.new)] < _TRUST:
             return False
         self._loops.append(loop)
@@ -123,7 +152,7 @@ class LoopCloser:
         place = world.covisible(world.anchor(loop.old)[0].seen_points(), _FUSE)
         for here in world.covisible(keyframe.seen_points(), _FUSE):
             fuse_into(world, world.points_of(place), here, world.keyframes)
-        adjust_window(world, keyframe, self._reprojection)
+        adjust_window(world, keyframe, self._reprojection, self._config.bundle_adjustment)
 
 
 def _shared_points(world: Map) -> NDArray[np.int64]:

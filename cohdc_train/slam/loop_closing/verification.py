@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import LoopVerificationConfig, MatchingConfig, RansacConfig
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.geometry.depth_image import DepthImage
@@ -52,9 +53,15 @@ class LoopVerifier:
     """Checks candidates; all its randomness comes from `rng`."""
 
     def __init__(
-        self, world: Map, reprojection: ReprojectionModel, rng: np.random.Generator
+        self,
+        world: Map,
+        reprojection: ReprojectionModel,
+        rng: np.random.Generator,
+        matching: MatchingConfig = MatchingConfig(),
+        ransac: RansacConfig = RansacConfig(),
     ) -> None:
         self._world, self._reprojection, self._rng = world, reprojection, rng
+        self._matching, self._ransac_config = matching, ransac
 
     def __call__(
         self, keyframe: Keyframe, old: Keyframe, pictures: Mapping[int, DepthImage]
@@ -83,12 +90,17 @@ class LoopVerifier:
         """T_cw of a keyframe as if nothing were known about where it is: from points `ids` of an
         old place by their descriptors, then from all its points."""
         world, features = self._world, keyframe.features.without_subpixel
-        rough = self._ransac(features, match_descriptors(ids, world.descriptors[ids], features))
+        descriptors = world.descriptors[ids]
+        rough = self._ransac(
+            features, match_descriptors(ids, descriptors, features, self._matching)
+        )
         if rough is None:
             return None
         T_cw, inliers = rough, 0
         for radius in (10.0, 5.0):
-            matches = match_projected(world.project(place, T_cw), features, radius)
+            matches = match_projected(
+                world.project(place, T_cw), features, radius, self._matching
+            )
             seen = observations(features, matches.keypoints)
             T_cw, inlier = optimize_pose(
                 T_cw, world.positions[matches.points], seen, self._reprojection
@@ -103,7 +115,9 @@ class LoopVerifier:
         )
         if len(matches) < _MIN_ROUGH:
             return None
-        found = ransac_pose(points, seen, self._world.camera, self._rng, _HYPOTHESES)
+        found = ransac_pose(
+            points, seen, self._world.camera, self._rng, self._ransac_config, _HYPOTHESES
+        )
         if found is None or found[1].sum() < _MIN_ROUGH:
             return None
         T_cw, agree = found
@@ -132,7 +146,7 @@ class LoopVerifier:
 
     def _align(self, T: Array, of_map: DepthImage, local: DepthImage) -> Array | None:
         """T refined by the pictures, if they confirm it (paper 2.3, equations 10 to 12)."""
-        found = align(of_map, local, T)
+        found = align(of_map, local, T, LoopVerificationConfig())
         if found is None or found.after > _NO_WORSE * found.before:
             return None
         sure = found.correlation >= _MIN_CORRELATION
