@@ -9,7 +9,7 @@ from typing import Any
 
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
-from cohdc_train.slam.config import MAX_KEYPOINTS, Culling, Method
+from cohdc_train.slam.config import MAX_KEYPOINTS, Culling, MaskConfig, Method
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, no_masks
 from cohdc_train.slam.frame import PoseCallback
 from cohdc_train.slam.geometry.calibration import choose_camera
@@ -261,10 +261,18 @@ def _masks(
     model: Path | None, masks: Path | None, camera: Camera, culling: Culling, threads: int
 ) -> MaskFolder | SegmenterMasks | None:
     """threads: of the segmenter, 0 = as many as there are cores."""
+    classes = culling.dynamic_classes
+    config = MaskConfig(
+        dynamic_classes=None if classes is None else tuple(classes),
+        min_score=culling.score,
+        min_quality=culling.quality,
+        dilation_px=culling.dilate,
+        quality_dilation=culling.doubt,
+    )
     if masks is not None:
-        return MaskFolder(masks, camera, culling)
+        return MaskFolder(masks, camera, config)
     if model is None:
         return None
     from cohdc_train.segmenter import Segmenter
 
-    return SegmenterMasks(Segmenter(model, threads), culling)
+    return SegmenterMasks(Segmenter(model, threads), config)
