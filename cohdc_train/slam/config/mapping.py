@@ -85,7 +85,7 @@ class KeyframeCullingConfig:
         check = Check("keyframe_culling", self)
         check.within(0, 1, "redundancy_ratio")
         check.at_least(1, "min_other_observers", "neighborhood")
-        check.at_least(0, "max_coarser_levels")
+        check.within(0, 16, "max_coarser_levels")
 
 
 @dataclass(frozen=True)

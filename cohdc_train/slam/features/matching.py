@@ -5,12 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import MatchingConfig
 from cohdc_train.slam.features.descriptors import bits_of, hamming
-from cohdc_train.slam.features.keypoints import LEVELS, Features
-
-_WIDEST = (
-    2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
-)
+from cohdc_train.slam.features.keypoints import Features
 
 
 @dataclass(frozen=True)
@@ -47,25 +44,26 @@ class Projected:
 def match_projected(
     projected: Projected,
     features: Features,
-    radius: float,
-    max_distance: int = 90,
-    ratio: float = 0.9,
+    radius_px: float,
+    config: MatchingConfig,
+    max_hamming: int | None = None,
 ) -> Matches:
-    """Nearest descriptor among the corners near each point: within one level and `radius` px.
+    """Match each point with the nearest descriptor among the keypoints near its projection.
 
-    radius: px at level 0, growing with the corner's scale up to twofold; max_distance: bits; ratio:
-    the best must beat this share of the second best. One corner takes one point.
+    radius_px: at level 0; it grows with the keypoint's scale up to config.max_radius_scale.
+    max_hamming: bits, in place of config.max_hamming. A keypoint matches one point.
     """
+    limit = config.max_hamming if max_hamming is None else max_hamming
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    reach = radius * np.minimum(features.scales, _WIDEST)
+    reach = radius_px * np.minimum(features.scales, config.max_radius_scale)
     i, j = _neighbors(projected, features, float(reach.max()))
     x, y = projected.pixels.T.take(i, axis=1) - features.points.T.take(j, axis=1)
     near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])
     i, j = i[near], j[near]
     bits = hamming(projected.descriptors[i], features.descriptors[j])
-    keep = bits <= max_distance
-    i, j = one_to_one(i[keep], j[keep], bits[keep], ratio)
+    keep = bits <= limit
+    i, j = one_to_one(i[keep], j[keep], bits[keep], config.ratio)
     return Matches(projected.ids[i], j)
 
 
@@ -86,7 +84,8 @@ def _neighbors(
     width, height = (cells.max(axis=0) + 2).tolist()
     key = ((features.octaves + 1) * height + cells[:, 1]) * width + cells[:, 0]
     order = np.argsort(key, kind="stable")
-    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=(LEVELS + 2) * height * width))]
+    num_levels = features.pyramid.num_levels + 2
+    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=num_levels * height * width))]
     places = np.floor((projected.pixels - keypoint) / reach).astype(np.int64)
     x, y = np.clip(places, 0, (width - 1, height - 1)).T
     beside = np.arange(-1, 2)[:, None]
@@ -131,10 +130,11 @@ def match_descriptors(
     ids: NDArray[np.int64],
     descriptors: NDArray[np.uint64],
     features: Features,
-    max_distance: int = 60,
+    config: MatchingConfig,
 ) -> Matches:
-    """Mutually nearest descriptors without any idea of the pose. ids: [m]; descriptors: [m, 4] of
-    the map points.
+    """Match mutually nearest descriptors without a pose.
+
+    ids: [m] map points; descriptors: [m, 4] of these points.
     """
     if len(ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -143,7 +143,7 @@ def match_descriptors(
     )  # 256 bits less twice those that differ
     nearest = alike.argmax(axis=1)
     rows = np.flatnonzero(alike.argmax(axis=0)[nearest] == np.arange(len(ids)))
-    rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * max_distance]
+    rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * config.max_hamming_unguided]
     return Matches(ids[rows], nearest[rows])
 
 

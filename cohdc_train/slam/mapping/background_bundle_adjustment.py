@@ -10,6 +10,7 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from cohdc_train.slam.config import BundleAdjustmentConfig
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import (
@@ -26,9 +27,12 @@ from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 class BackgroundMapper:
     """Bundle adjustments, one after the other, in an executor."""
 
-    def __init__(self, executor: Executor, reprojection: ReprojectionModel) -> None:
+    def __init__(
+        self, executor: Executor, reprojection: ReprojectionModel, config: BundleAdjustmentConfig
+    ) -> None:
         self._executor = executor
         self._reprojection = reprojection
+        self._config = config
         self._running: tuple[Window, Future[Solution]] | None = None
         self._waiting: Keyframe | None = None
 
@@ -47,9 +51,10 @@ class BackgroundMapper:
         if self._running is not None:
             self._waiting = keyframe
             return
-        window = open_window(world, keyframe)
+        window = open_window(world, keyframe, self._config)
         poses = np.stack(window.poses)
-        job = self._executor.submit(solve, poses, window.points, window.problem, self._reprojection)
+        problem = poses, window.points, window.problem, self._reprojection, self._config
+        job = self._executor.submit(solve, *problem)
         self._running = window, job
 
     def collect(self, world: Map) -> Array | None:

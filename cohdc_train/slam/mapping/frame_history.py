@@ -10,7 +10,7 @@ import numpy as np
 from cohdc_train.slam.geometry.se3 import Array, inverse
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
+from cohdc_train.slam.optimization.trajectory_smoothing import TrackedPoses
 
 
 class _Logged(NamedTuple):
@@ -35,7 +35,7 @@ class FrameHistory:
         self,
         t: float,
         T_cw: Array,
-        reference: Keyframe,
+        reference: Keyframe | None,
         information: Array,
         pull: Array,
         world: Map,
@@ -45,6 +45,8 @@ class FrameHistory:
         T_cw: [4, 4] world to camera, m; reference: the keyframe it stays relative to; information,
         pull: as `_Logged`.
         """
+        if reference is None:
+            raise ValueError(f"frame at {t:.6f} s has no reference keyframe")
         relative = T_cw @ inverse(world.pose(reference.index))
         self._frames.append(_Logged(t, reference.index, relative, information, pull))
         return len(self._frames) - 1
@@ -70,14 +72,13 @@ class FrameHistory:
             frame = self._frames[row]
             self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
 
-    def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
-        """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has
-        them now.
-        """
-        stamps, poses = self.stamps, self.poses(world)
-        if smooth and len(poses):
-            information = np.stack([frame.information for frame in self._frames])
-            poses = smoothed(
-                stamps, poses, information, np.stack([frame.pull for frame in self._frames])
-            )
-        return stamps, inverse(poses)
+    def tracked_poses(self, world: Map) -> TrackedPoses:
+        """Return all frames for smoothing, with poses as the map has them now."""
+        information = [frame.information for frame in self._frames]
+        gradients = [frame.pull for frame in self._frames]
+        return TrackedPoses(
+            self.stamps,
+            self.poses(world),
+            np.stack(information) if information else np.zeros((0, 6, 6)),
+            np.stack(gradients) if gradients else np.zeros((0, 6)),
+        )

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import BundleAdjustmentConfig
 from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, measurement_chi2
 from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel, joined
-
-WINDOW = 12  # keyframes in local bundle adjustment
-FIXED = 3  # of them hold still and carry the frame of reference
 
 
 @dataclass(frozen=True)
@@ -57,11 +55,15 @@ class Solution:
     good: NDArray[np.bool_]
 
 
-def open_window(world: Map, keyframe: Keyframe) -> Window:
-    """The keyframe with those that share most points, and their measurements."""
-    keyframes = world.covisible(keyframe.seen_points(), WINDOW)
+def open_window(world: Map, keyframe: Keyframe, config: BundleAdjustmentConfig) -> Window:
+    """Build the window of a keyframe: those that share most points with it, and what they observe.
+
+    At most a quarter of the keyframes is fixed.
+    """
+    keyframes = world.covisible(keyframe.seen_points(), config.local_keyframes)
     keyframes.sort(key=lambda k: k.index)
-    return select_window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
+    num_fixed = max(1, min(config.local_fixed, len(keyframes) // 4))
+    return select_window(world, keyframes, num_fixed)
 
 
 def select_window(
@@ -90,14 +92,17 @@ def select_window(
 
 
 def solve(
-    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel
+    poses: Array,
+    points: Array,
+    problem: Problem,
+    reprojection: ReprojectionModel,
+    config: BundleAdjustmentConfig,
 ) -> Solution:
-    """Robustly first, then once more without the measurements that do not fit. Arrays as in
-    `Window`.
-    """
-    poses, points = adjust(poses, points, problem, reprojection, steps=5)
+    """Minimize the robust cost, then the squared one without outliers. Arrays as in `Window`."""
+    poses, points = adjust(poses, points, problem, reprojection, config.robust_steps)
     good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
-    poses, points = adjust(poses, points, problem.take(good), reprojection, steps=3, robust=False)
+    inliers, steps = problem.take(good), config.final_steps
+    poses, points = adjust(poses, points, inliers, reprojection, steps, robust=False)
     good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
     return Solution(poses, points, good)
 
@@ -133,11 +138,11 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
     return motion
 
 
-def adjust_window(world: Map, keyframe: Keyframe, reprojection: ReprojectionModel) -> None:
-    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not
-    fit are dropped.
-    """
-    window = open_window(world, keyframe)
-    close_window(
-        world, window, solve(np.stack(window.poses), window.points, window.problem, reprojection)
-    )
+def adjust_window(
+    world: Map, keyframe: Keyframe, reprojection: ReprojectionModel, config: BundleAdjustmentConfig
+) -> None:
+    """Bundle-adjust the newest keyframe with those that share most points, and drop outliers."""
+    window = open_window(world, keyframe, config)
+    poses = np.stack(window.poses)
+    solution = solve(poses, window.points, window.problem, reprojection, config)
+    close_window(world, window, solution)

@@ -9,18 +9,11 @@ from cohdc_train.slam.features.matching import match_projected
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 
-_FUSE_KEYFRAMES = 8
-_TRIAL = 3  # keyframes after which a point must have proved itself
-MIN_SEEN_BY = 2  # keyframes that must see a point, as ORB-SLAM2 has it where depth is measured
-_MIN_FOUND = 0.25
 
-
-def add_points(world: Map, keyframe: Keyframe) -> None:
-    """A point for every corner with depth that belongs to none."""
+def add_points(world: Map, keyframe: Keyframe, max_depth_m: float) -> None:
+    """Create a point for every keypoint with usable depth that belongs to none."""
     features = keyframe.features
-    usable = (keyframe.point_ids < 0) & (
-        features.depths <= world.camera.max_depth_m
-    )  # nan compares False
+    usable = (keyframe.point_ids < 0) & (features.depths <= max_depth_m)  # nan compares False
     world.add_points(keyframe, np.flatnonzero(usable))
 
 
@@ -29,7 +22,7 @@ def fuse(world: Map, keyframe: Keyframe) -> None:
     older point.
     """
     ids = keyframe.seen_points()
-    neighbors = [k for k in world.covisible(ids, _FUSE_KEYFRAMES + 1) if k is not keyframe]
+    neighbors = [k for k in world.covisible(ids, world.config.fuse_keyframes + 1) if k is not keyframe]
     pairs = [_look_for(world, ids, other) for other in neighbors]
     if pairs:
         _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbors])
@@ -50,8 +43,11 @@ def _look_for(world: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np
 
     Returns [2, k] such points, and those that their corners belong to.
     """
+    config = world.config
     projected = world.project(world.unseen(ids, other), other.T_cw)
-    matches = match_projected(projected, other.features, radius=3.0, max_distance=60)
+    matches = match_projected(
+        projected, other.features, config.fuse_radius_px, world.matching, config.fuse_max_hamming
+    )
     current = other.point_ids[matches.keypoints]
     world.observe(other, matches.take(current < 0))
     return np.stack([matches.points, current])[:, current >= 0]
@@ -59,8 +55,8 @@ def _look_for(world: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np
 
 def _merge(world: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
     """Of pairs [2, k] of points that look alike, those that are near each other become one."""
-    near = np.linalg.norm(world.positions[pairs[0]] - world.positions[pairs[1]], axis=1) < 0.05
-    first, second = pairs[:, near]
+    distance = np.linalg.norm(world.positions[pairs[0]] - world.positions[pairs[1]], axis=1)
+    first, second = pairs[:, distance < world.config.fuse_distance_m]
     if len(first) == 0:
         return
     later = world.first_keyframe[first] - world.first_keyframe[second]
@@ -78,14 +74,14 @@ def cull(world: Map, newest: int) -> None:
     """Drop young points that few keyframes confirmed or that frames rarely found where they should
     be.
     """
-    young = np.flatnonzero(
-        (world.first_keyframe[: world.size] >= newest - _TRIAL)
-        & (world.num_observations[: world.size] > 0)
-    )
-    weak = (world.first_keyframe[young] == newest - _TRIAL) & (
-        world.num_observations[young] < MIN_SEEN_BY
-    )
-    weak |= world.found[young] < _MIN_FOUND * world.visible[young]
+    config = world.config
+    oldest = newest - config.probation_keyframes
+    is_young = world.first_keyframe[: world.size] >= oldest
+    young = np.flatnonzero(is_young & (world.num_observations[: world.size] > 0))
+
+    weak = world.first_keyframe[young] == oldest
+    weak &= world.num_observations[young] < config.min_observations
+    weak |= world.found[young] < config.min_found_ratio * world.visible[young]
     drop_points(world, young[weak])
 
 

@@ -12,6 +12,7 @@ from scipy import sparse
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 from cohdc_train.slam.optimization.linear_solver import solve_symmetric
 from cohdc_train.slam.optimization.reprojection import (
+    MIN_DEPTH_M,
     Observations,
     ReprojectionModel,
     huber_weights,
@@ -75,7 +76,7 @@ def measurement_chi2(
     """[m] squared residual in sigmas; infinite where the point lies behind the camera."""
     local = local_points(poses, points, problem)
     error = residuals(local, problem.seen, reprojection)
-    return np.where(local[:, 2] > 0.05, np.einsum("mi,mi->m", error, error), np.inf)
+    return np.where(local[:, 2] > MIN_DEPTH_M, np.einsum("mi,mi->m", error, error), np.inf)
 
 
 def adjust(
