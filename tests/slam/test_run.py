@@ -16,10 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.files import MANIFEST, files_below
-from cohdc_train.segmenter import Detections
-from cohdc_train.slam.config import Culling, Method
-from cohdc_train.slam.dynamics.mask_sources import SegmenterMasks
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.config import Method
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import RecordedSequence
 from cohdc_train.slam.run import run_source, slam
@@ -252,66 +249,6 @@ def test_a_truth_of_another_time_costs_the_scores_not_the_run(
     assert "ate_m" not in metrics
     assert "no scores: 0 of 4 poses lie within" in capsys.readouterr().err
     assert (tmp_path / "out" / "trajectory.txt").is_file()
-
-
-class TwoClasses:
-    """Stands for a segmenter: one person in the left half of whatever it sees."""
-
-    class_names = ("person", "chair")
-
-    def __init__(self, quality: float = 1.0, cut_by_quality: bool = False) -> None:
-        self.quality = np.full(1, quality, dtype=np.float32)
-        self.cut_by_quality = cut_by_quality
-
-    def __call__(self, rgb: np.ndarray) -> Detections:
-        height, width = rgb.shape[:2]
-        box = np.array([[0, 0, width / 2, height]], dtype=np.float32)
-        one = np.ones(1, dtype=np.float32)
-        mask = np.ones((1, 28, 28), dtype=np.float32)
-        return Detections(
-            box,
-            np.zeros(1, dtype=np.int64),
-            one,
-            self.quality,
-            mask,
-            (height, width),
-            self.class_names,
-        )
-
-
-def test_a_model_masks_the_classes_that_are_asked_for() -> None:
-    view = View(
-        0.0,
-        "0",
-        "0",
-        np.zeros((240, 320, 3), dtype=np.uint8),
-        np.zeros((240, 320), dtype=np.float32),
-    )
-    model = TwoClasses()
-    assert SegmenterMasks(model, Culling(dilate=0))(view).mean() == 0.5  # type: ignore[arg-type]
-    chairs = SegmenterMasks(model, Culling(dynamic_classes=["chair"]))  # type: ignore[arg-type]
-    assert not chairs(view).any()
-    with pytest.raises(DataError, match="'dog' is not one of the model's: person, chair"):
-        SegmenterMasks(model, Culling(dynamic_classes=["dog"]))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("cut_by_quality", "doubt", "px"),
-    [(False, None, 20), (True, None, 10), (True, 1.0, 20), (False, 0.0, 10)],
-)
-def test_a_doubtful_contour_grows_more_unless_its_cut_has_seen_to_that(
-    cut_by_quality: bool, doubt: float | None, px: int
-) -> None:
-    view = View(
-        0.0,
-        "0",
-        "0",
-        np.zeros((240, 320, 3), dtype=np.uint8),
-        np.zeros((240, 320), dtype=np.float32),
-    )
-    masks = SegmenterMasks(TwoClasses(0.0, cut_by_quality), Culling(dilate=10, doubt=doubt))  # type: ignore[arg-type]
-    assert masks(view)[120].sum() == 160 + px
-    assert masks.segment(view)[1] == px
 
 
 def threads() -> set[int]:

@@ -22,7 +22,7 @@ from slam_method import add_method_option
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.slam.config import Culling, Method
+from cohdc_train.slam.config import MaskConfig, Method
 from cohdc_train.slam.dynamics.mask_propagation import (
     PropagatedMask,
     SegmentationJob,
@@ -89,8 +89,8 @@ def opened(folder: Path, model: Path | None) -> tuple[RecordedSequence, SegmentF
     if source.groundtruth is None:
         raise DataError(f"{folder}: no groundtruth.txt to score by")
     if model is None:
-        return source, remembered(MaskFolder(folder / "masks", camera, Culling()).segment)
-    return source, remembered(SegmenterMasks(Segmenter(model), Culling()).segment)
+        return source, remembered(MaskFolder(folder / "masks", camera, MaskConfig()).segment)
+    return source, remembered(SegmenterMasks(Segmenter(model), MaskConfig()).segment)
 
 
 def error(

@@ -22,7 +22,7 @@ class MaskConfig:
         max_depth_change_m: largest change of an object's depth from one frame to the next, m.
         edge_band_px: radius within which one step may snap the mask's edge to a depth edge, px at
             half size.
-        window_px: radius of the window of the mask's own depth, px at half size.
+        window_px: side of the window that the mask's own depth is averaged over, px at half size.
         max_history: frames through which a delayed mask is propagated one by one.
     """
 

@@ -9,11 +9,6 @@ from cohdc_train.slam.dynamics.moving_surfaces import MovingSurfaceTracker, Surf
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
 
-_REFERENCE_KEYFRAMES = 8
-_MASK_MARGIN_PX = 8.0
-_RECENT_S = 0.5
-_REST_S = 2.0
-
 
 class DynamicMaskEstimator:
     """Estimator of the dynamic masks of consecutive frames."""
@@ -21,7 +16,8 @@ class DynamicMaskEstimator:
     def __init__(self, checker: FreeSpaceChecker) -> None:
         """Start without moving surfaces. checker: compares depth for the camera of the frames."""
         self._checker = checker
-        self._surfaces = MovingSurfaceTracker()
+        self._config = checker.config
+        self._surfaces = MovingSurfaceTracker(checker.surfaces)
 
     def reset(self) -> None:
         """Forget all moving surfaces, as after a loss of tracking."""
@@ -47,18 +43,20 @@ class DynamicMaskEstimator:
         Returns:
             [H, W] bool, True = dynamic; None where no mask was given and nothing moves.
         """
+        config = self._config
         neighbors = sorted(neighbors, key=lambda keyframe: keyframe.index)
-        current = _select_evenly(neighbors)
-        old = _select_evenly([k for k in neighbors if k.t <= timestamp - _REST_S])
+        current = _select_evenly(neighbors, config.reference_keyframes)
+        old = [k for k in neighbors if k.t <= timestamp - config.rest_s]
+        old = _select_evenly(old, config.reference_keyframes)
         comparison = _Comparisons(self._checker, depth, T_cw, [*current, *old])
-        old_static = comparison.with_keyframes(old)
+        with_old = comparison.with_keyframes(old)
 
-        moving_cells = self._update_surfaces(mask, comparison, current, old_static, timestamp)
-        moving = dilate_mask(self._checker.upsample(moving_cells), _MASK_MARGIN_PX)
+        moving_cells = self._update_surfaces(mask, comparison, current, with_old, timestamp)
+        moving = dilate_mask(self._checker.upsample(moving_cells), config.mask_margin_px)
         if mask is None:
             return moving if moving.any() else None
         if old:
-            mask = mask & ~self._checker.static_components(mask, old_static)
+            mask = mask & ~self._checker.static_components(mask, with_old)
         return mask | moving
 
     def _update_surfaces(
@@ -66,18 +64,18 @@ class DynamicMaskEstimator:
         mask: Mask | None,
         comparison: "_Comparisons",
         current: list[Keyframe],
-        old_static: DepthComparison,
+        with_old: DepthComparison,
         timestamp: float,
     ) -> NDArray[np.bool_]:
         """Return the cells [h, w] that move, extended to whole surfaces."""
         depth = comparison.depth
-        recent = [k for k in comparison.keyframes if k.t <= timestamp - _RECENT_S]
+        recent = [k for k in comparison.keyframes if k.t <= timestamp - self._config.recent_s]
         moving = self._checker.find_moving(comparison.with_keyframes(current))
         masked = np.zeros_like(moving) if mask is None else self._checker.downsample(mask)
         # Without a keyframe of that age all cells count as static, so no surface is extended.
         everywhere = np.ones(depth.shape, dtype=np.bool_)
         static_recently = comparison.with_keyframes(recent).static if recent else everywhere
-        evidence = SurfaceEvidence(depth, moving, static_recently, old_static.static, masked)
+        evidence = SurfaceEvidence(depth, moving, static_recently, with_old.static, masked)
         return self._surfaces.update(timestamp, evidence)
 
 
@@ -105,9 +103,9 @@ class _Comparisons:
         return self._all.select([self._row[keyframe.index] for keyframe in keyframes])
 
 
-def _select_evenly(keyframes: list[Keyframe]) -> list[Keyframe]:
-    """Select a limited number of keyframes, evenly spaced in the list."""
+def _select_evenly(keyframes: list[Keyframe], limit: int) -> list[Keyframe]:
+    """Select at most `limit` keyframes, evenly spaced in the list."""
     if not keyframes:
         return []
-    places = np.linspace(0, len(keyframes) - 1, _REFERENCE_KEYFRAMES).round().astype(int)
+    places = np.linspace(0, len(keyframes) - 1, limit).round().astype(int)
     return [keyframes[place] for place in np.unique(places).tolist()]

@@ -12,16 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import SurfaceConfig
 from cohdc_train.slam.geometry.se3 import Array
-
-DEPTH_JUMP_M = 0.12
-MIN_AREA = 8
-_MIN_MOVING_RATIO = 0.4
-_MIN_CONTINUED_RATIO = 0.5
-_MAX_STATIC_RATIO = 0.3
-_MEMORY_S = 0.5
-_MASK_RIM_CELLS = 3
-_MAX_MOVING_RATIO = 0.95
 
 BoolGrid = NDArray[np.bool_]  # [h, w] cells
 DepthGrid = NDArray[np.float32]  # [h, w] m, 0 = unknown; without distortion
@@ -64,8 +56,9 @@ class _Memory:
 class MovingSurfaceTracker:
     """Tracker of moving surfaces over consecutive frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: SurfaceConfig = SurfaceConfig()) -> None:
         """Start without moving surfaces."""
+        self._config = config
         self._memory: _Memory | None = None
 
     def reset(self) -> None:
@@ -82,12 +75,13 @@ class MovingSurfaceTracker:
         Returns:
             [h, w] bool, True = moving and not masked.
         """
+        config = self._config
         depth = evidence.depth
         if not (depth > 0).any():
             return np.zeros_like(evidence.moving)
         visible = (depth > 0) & ~evidence.masked
         moved_before = self._moved_before(depth)
-        labels = label_surfaces(np.where(visible, depth, np.float32(0)))
+        labels = label_surfaces(np.where(visible, depth, np.float32(0)), config.depth_jump_m)
         num_surfaces = int(labels.max(initial=0)) + 1
 
         def count(cells: BoolGrid) -> NDArray[np.int64]:
@@ -97,18 +91,18 @@ class MovingSurfaceTracker:
         num_moving = count(evidence.moving)
         last_seen = self._last_seen(timestamp, num_moving, labels, moved_before & visible)
 
-        is_large = area >= MIN_AREA
-        starts = is_large & (num_moving >= _MIN_MOVING_RATIO * area)
-        starts &= count(evidence.static_recently) <= _MAX_STATIC_RATIO * area
+        is_large = area >= config.min_area
+        starts = is_large & (num_moving >= config.min_moving_ratio * area)
+        starts &= count(evidence.static_recently) <= config.max_static_ratio * area
 
-        continues = is_large & (count(moved_before) >= _MIN_CONTINUED_RATIO * area)
-        continues &= count(evidence.static_long) <= _MAX_STATIC_RATIO * area
-        continues &= timestamp - last_seen <= _MEMORY_S
+        continues = is_large & (count(moved_before) >= config.min_continued_ratio * area)
+        continues &= count(evidence.static_long) <= config.max_static_ratio * area
+        continues &= timestamp - last_seen <= config.memory_s
 
         still_moving = continues[labels] & (moved_before | ~evidence.static_recently)
         moving = visible & (evidence.moving | starts[labels] | still_moving)
         # Where nearly all cells seem to move, the predicted pose is wrong.
-        if np.count_nonzero(moving) > _MAX_MOVING_RATIO * np.count_nonzero(visible):
+        if np.count_nonzero(moving) > config.max_moving_ratio * np.count_nonzero(visible):
             moving = np.zeros_like(moving)
 
         masked_surfaces = self._masked_surfaces(evidence)
@@ -125,7 +119,8 @@ class MovingSurfaceTracker:
         if self._memory is None:
             return np.zeros(depth.shape, dtype=np.bool_)
         before = self._memory.depth
-        return (before > 0) & (np.abs(before - depth) < DEPTH_JUMP_M)
+        is_near = np.abs(before - depth) < self._config.depth_jump_m
+        return np.asarray((before > 0) & is_near)
 
     def _last_seen(
         self,
@@ -143,41 +138,45 @@ class MovingSurfaceTracker:
         if self._memory is not None:
             cells = moved_before
             np.maximum.at(last_seen, labels[cells], self._memory.last_seen[cells])
-        return np.where(num_moving >= MIN_AREA, timestamp, last_seen)
+        return np.where(num_moving >= self._config.min_area, timestamp, last_seen)
 
     def _masked_surfaces(self, evidence: SurfaceEvidence) -> BoolGrid:
         """Return the cells [h, w] of surfaces that were masked in this frame and in the latest."""
         masked = evidence.masked
         if self._memory is not None:
             masked = masked & self._memory.masked
-        return _covered_surfaces(masked, evidence.depth)
+        return _covered_surfaces(masked, evidence.depth, self._config)
 
 
-def _covered_surfaces(masked: BoolGrid, depth: DepthGrid) -> BoolGrid:
+def _covered_surfaces(masked: BoolGrid, depth: DepthGrid, config: SurfaceConfig) -> BoolGrid:
     """Select the surfaces under a mask that reach past its rim, where it covers the background."""
-    side = 2 * _MASK_RIM_CELLS + 1
-    border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": (0,)}
-    inner = cv2.erode(masked.astype(np.uint8), np.ones((side, side), np.uint8), **border) > 0
-    labels = label_surfaces(np.where(masked, depth, np.float32(0)))
+    side = 2 * config.mask_rim_cells + 1
+    kernel = np.ones((side, side), np.uint8)
+    # The image border counts as the mask's edge.
+    padding, outside = cv2.BORDER_CONSTANT, (0,)
+    values = masked.astype(np.uint8)
+    inner = cv2.erode(values, kernel, borderType=padding, borderValue=outside) > 0
+    labels = label_surfaces(np.where(masked, depth, np.float32(0)), config.depth_jump_m)
     num_surfaces = int(labels.max(initial=0)) + 1
-    reaches = np.bincount(labels[inner], minlength=num_surfaces) >= MIN_AREA
+    reaches = np.bincount(labels[inner], minlength=num_surfaces) >= config.min_area
     reaches[0] = False
     return np.asarray(reaches[labels])
 
 
-def label_surfaces(depth: DepthGrid) -> NDArray[np.int32]:
-    """Number the connected surfaces of a depth image.
+def label_surfaces(depth: DepthGrid, depth_jump_m: float) -> NDArray[np.int32]:
+    """Assign a number to each connected surface of a depth image.
 
     Args:
         depth: [h, w] m, 0 = unknown.
+        depth_jump_m: step between two cells from which on they belong to two surfaces, m.
 
     Returns:
         [h, w] int32, 0 where depth is unknown.
     """
     height, width = depth.shape
     known = depth > 0
-    joins_right = np.abs(depth[:, 1:] - depth[:, :-1]) < DEPTH_JUMP_M
-    joins_below = np.abs(depth[1:] - depth[:-1]) < DEPTH_JUMP_M
+    joins_right = np.abs(depth[:, 1:] - depth[:, :-1]) < depth_jump_m
+    joins_below = np.abs(depth[1:] - depth[:-1]) < depth_jump_m
 
     # Cells at even coordinates, and between two cells a node that is set where they are connected.
     nodes = np.zeros((2 * height - 1, 2 * width - 1), dtype=np.uint8)

@@ -2,18 +2,10 @@
 detections.
 """
 
-import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from plane_world import CAMERA, render, room
 
-from cohdc_train.errors import DataError
-from cohdc_train.segmenter import Detections
-from cohdc_train.slam.config import Culling
-from cohdc_train.slam.dynamics.mask_sources import dynamic_mask
-from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.features.depth_sampling import sample_depth
 from cohdc_train.slam.features.descriptors import hamming
 from cohdc_train.slam.features.keypoints import Features
@@ -96,95 +88,6 @@ def test_features_cannot_disagree_in_shape() -> None:
             np.zeros(2),
             np.zeros(2, bool),
         )
-
-
-def detections(*rows: tuple[tuple[float, float, float, float], int, float, float]) -> Detections:
-    """Full boxes: (box, label, score, quality)."""
-    return Detections(
-        boxes=np.array([row[0] for row in rows], dtype=np.float32).reshape(-1, 4),
-        labels=np.array([row[1] for row in rows], dtype=np.int64),
-        scores=np.array([row[2] for row in rows], dtype=np.float32),
-        quality=np.array([row[3] for row in rows], dtype=np.float32),
-        roi_masks=np.ones((len(rows), 28, 28), dtype=np.float32),
-        size=(240, 320),
-        class_names=("person", "chair"),
-    )
-
-
-def test_doubtful_contours_get_a_wider_band_and_are_never_dropped() -> None:
-    box = (100.0, 100.0, 150.0, 150.0)
-    culling = Culling(dilate=10)
-    sure = dynamic_mask(detections((box, 0, 0.9, 1.0)), frozenset([0]), culling)
-    unsure = dynamic_mask(detections((box, 0, 0.9, 0.0)), frozenset([0]), culling)
-    assert sure[125, 90]
-    assert not sure[125, 88]
-    assert unsure[125, 80]
-    assert not unsure[125, 78]
-
-
-def test_without_doubt_all_contours_grow_alike() -> None:
-    box = (100.0, 100.0, 150.0, 150.0)
-    masks = [
-        dynamic_mask(
-            detections((box, 0, 0.9, quality)), frozenset([0]), Culling(dilate=10, doubt=0.0)
-        )
-        for quality in (0.0, 1.0)
-    ]
-    np.testing.assert_array_equal(*masks)
-
-
-def test_only_dynamic_classes_above_the_score_count() -> None:
-    left, middle, right = (
-        (10.0, 10.0, 40.0, 40.0),
-        (100.0, 10.0, 140.0, 40.0),
-        (200.0, 10.0, 240.0, 40.0),
-    )
-    found = detections((left, 0, 0.9, 1.0), (middle, 1, 0.9, 1.0), (right, 0, 0.3, 1.0))
-    mask = dynamic_mask(found, frozenset([0]), Culling(dilate=0))
-    assert mask.sum() == 30 * 30
-    assert mask[20, 20]
-    assert not dynamic_mask(detections(), frozenset([0]), Culling()).any()
-
-
-def test_the_papers_filter_leaves_a_doubted_contour_out() -> None:
-    box = (10.0, 10.0, 30.0, 30.0)
-    for quality, dynamic in ((0.95, True), (0.85, False)):
-        found = dynamic_mask(
-            detections((box, 0, 0.9, quality)), frozenset([0]), Culling(quality=0.9, dilate=0)
-        )
-        assert found.any() == dynamic
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(0.5, 40.0))
-@settings(max_examples=30, deadline=None)
-def test_grow_looks_at_a_window_and_gives_what_the_whole_image_would(
-    seed: int, radius: float
-) -> None:
-    rng = np.random.default_rng(seed)
-    mask = np.zeros((60, 80), bool)
-    for row, column in zip(rng.integers(0, 60, 3), rng.integers(0, 80, 3), strict=True):
-        mask[row : row + 7, column : column + 4] = True
-    whole = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= radius
-    assert np.array_equal(dilate_mask(mask, radius), whole)
-
-
-def test_grow_is_a_disc() -> None:
-    mask = np.zeros((41, 41), dtype=np.bool_)
-    mask[20, 20] = True
-    v, u = np.mgrid[:41, :41]
-    exact = np.hypot(u - 20, v - 20)
-    grown = dilate_mask(mask, 8.0)
-    assert grown[exact < 7.5].all()
-    assert not grown[exact > 8.5].any()
-    assert dilate_mask(mask, 0.0).sum() == 1
-
-
-@pytest.mark.parametrize(
-    "bad", [{"dilate": -1}, {"score": 1.5}, {"doubt": -0.1}, {"doubt": float("nan")}]
-)
-def test_culling_refuses_nonsense(bad: dict[str, float]) -> None:
-    with pytest.raises(DataError, match=next(iter(bad))):
-        Culling(**bad)  # type: ignore[arg-type]
 
 
 def test_mutually_nearest_descriptors_are_those_of_a_search_through_all() -> None:

@@ -55,7 +55,9 @@ def test_order_of_choice(tmp_path: Path) -> None:
     given_file.write_text(CAMERA_YAML.replace("fx: 260", "fx: 300"))
     assert choose_camera(sequence, None)[0] == CAMERA
     assert choose_camera(sequence, given_file)[0].fx == 300
-    with pytest.raises(DataError, match=r"unnamed: cannot tell the camera .* --camera"):
+    with pytest.raises(
+        DataError, match=r"unnamed: the folder.s name does not tell the camera; .* --camera"
+    ):
         choose_camera(tmp_path / "unnamed", None)
 
 
@@ -67,7 +69,7 @@ def test_order_of_choice(tmp_path: Path) -> None:
         (CAMERA_YAML.replace("cx: 159.5", "cx: nan"), ":3: cx is not a finite number"),
         (CAMERA_YAML + "k9: 1\n", ":8: unknown key 'k9'"),
         (CAMERA_YAML.replace("depth_scale: 5000\n", ""), ": missing depth_scale"),
-        ("fx: [1, 2\nfy: 3\n", "broken yaml"),
+        ("fx: [1, 2\nfy: 3\n", "broken YAML"),
         ("- 1\n", ":1: a camera file holds lines"),
     ],
 )
