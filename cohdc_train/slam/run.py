@@ -1,17 +1,22 @@
 """`cohdc slam` and `run_slam`: a sequence or a camera in, a trajectory and its scores out."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from cohdc_train import __version__
 from cohdc_train.errors import DataError
-from cohdc_train.slam.config import SlamConfig
+from cohdc_train.slam.config import SlamConfig, as_plain
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, no_masks
 from cohdc_train.slam.frame import PoseCallback
+from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
+from cohdc_train.slam.io.growing_sequence import GrowingSequence
 from cohdc_train.slam.io.live import stop_on_sigint
 from cohdc_train.slam.io.results import (
     check_output_dir,
@@ -19,18 +24,44 @@ from cohdc_train.slam.io.results import (
     move_into_place,
     write_run,
 )
-from cohdc_train.slam.io.sequence import open_source
-from cohdc_train.slam.io.sources import FrameSource
-from cohdc_train.slam.run_config import run_config
-from cohdc_train.slam.run_options import RunOptions
-from cohdc_train.slam.runner import RunObserver, TrackedSequence, track_sequence
+from cohdc_train.slam.io.sequence import choose_format
+from cohdc_train.slam.io.sources import FrameSource, RecordedSequence
+from cohdc_train.slam.runner import RunObserver, track_sequence
 from cohdc_train.slam.runtime.threads import single_threaded
 from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
-from cohdc_train.slam.summary import summary
 from cohdc_train.slam.system import Slam
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
 from cohdc_train.trajectory.trajectory import read_tum
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a run, beside its input and the settings of the SLAM system.
+
+    Args:
+        camera: camera YAML; else camera.yaml of the sequence, else a guess from the folder's name.
+        realtime: take frames at the pace of their timestamps, and drop delayed ones; masks and
+            mapping run in parallel with tracking. Results then depend on the machine.
+        dense_cloud: write cloud.ply too, the dense colored points of all static surfaces.
+        follow: the sequence is still being written: take frames as its lists grow.
+        idle_timeout: seconds without a new frame after which a followed sequence has ended; a file
+            named done in its folder ends it, too.
+        viewer: show the run in rerun's window; needs `pip install 'cohdc-train[view]'`.
+        rrd: file to record the same for rerun.
+    """
+
+    camera: Path | None = None
+    realtime: bool = False
+    dense_cloud: bool = False
+    follow: bool = False
+    idle_timeout: float = 10.0
+    viewer: bool = False
+    rrd: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.idle_timeout < float("inf"):
+            raise DataError(f"idle_timeout is {self.idle_timeout:g}; allowed: above 0")
 
 
 def slam(
@@ -101,12 +132,9 @@ def run_slam(
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
     check_output_dir(out, options.dense_cloud)
-    words: dict[str, object] = {}
+    sequence = source if isinstance(source, Path) else None
     if isinstance(source, Path):
-        words["sequence"] = str(source)
-        source = open_source(
-            source, options.camera, settings.stereo, options.follow, options.idle_timeout
-        )
+        source = _open_folder(source, settings, options)
     truth = None if source.groundtruth is None else read_tum(source.groundtruth)
     make_masks = _mask_source(model, masks, source.camera, settings, options.realtime)
     with (
@@ -117,13 +145,9 @@ def run_slam(
         with ExitStack() as stack:
             workers = None
             if options.realtime:
-                workers = stack.enter_context(
-                    start_workers(source, make_masks, settings.realtime)
-                )
+                workers = stack.enter_context(start_workers(source, make_masks))
             slam_system = _build_slam(source.camera, settings, workers)
-            files = stack.enter_context(
-                MapFiles(source.camera, part, options.dense_cloud, settings.dense_cloud)
-            )
+            files = stack.enter_context(MapFiles(source.camera, part, options.dense_cloud))
             watching: list[RunObserver] = [files, *observers]
             if options.viewer or options.rrd is not None:
                 viewer = RerunViewer(source.camera, options.viewer, options.rrd)
@@ -148,8 +172,89 @@ def run_slam(
         dropped = workers.source.dropped if workers else 0
         metrics |= compute_metrics(tracked.records, tracked.trajectory, truth, dropped)
         metrics |= workers.metrics() if workers else {}
-        config = run_config(words, out, model, masks, settings, options)
+        inputs = {"sequence": sequence, "model": model, "masks": masks}
+        config = _config_text(inputs, source.camera, settings, options)
         write_run(part, tracked.records, tracked.trajectory, metrics, config)
         move_into_place(part, out)
     print(f"{summary(metrics)}\nwritten to {out}")
     return metrics
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """Return the small table at the end of a run."""
+    tracked = f"{metrics['tracked']} of {metrics['frames']} tracked"
+    in_map = f"{metrics['keyframes_in_map']} of them in the map at the end"
+    rows = [
+        ("frames", f"{tracked} ({100 * metrics['coverage']:.1f} %)"),
+        ("keyframes", f"{metrics['keyframes']}, {in_map}"),
+        ("loops closed", str(metrics["loops"])),
+        ("frames/s", f"{metrics['fps']:.1f}"),
+    ]
+    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
+    if metrics["realtime"]:
+        rows.append(("dropped", str(metrics["dropped"])))
+        names = {
+            "segmenter_ms": "segmenter ms",
+            "mask_age_ms": "mask age ms",
+            "latency_ms": "latency ms",
+        }
+        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
+    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
+    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
+        if key in metrics:
+            values = [f"{name} {value:.4f}" for name, value in metrics[key].items()]
+            rows.append((key, "  ".join(values)))
+    return "\n".join(f"  {name:<16}{text}" for name, text in rows)
+
+
+def _open_folder(folder: Path, settings: SlamConfig, options: RunOptions) -> FrameSource:
+    """Open the folder of a sequence, and say what is read."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder")
+    camera, origin = choose_camera(folder, options.camera)
+    print(f"camera: {origin}")
+    form = choose_format(folder, camera, settings.stereo)
+    if options.follow:
+        end = f"a file {folder / 'done'} or Ctrl-C ends it"
+        print(f"sequence: {form.first} and {form.second} as they grow; {end}")
+        return GrowingSequence(folder, camera, form, options.idle_timeout)
+    source = RecordedSequence(folder, camera, form)
+    skipped = f"{source.num_unpaired} images without a partner are skipped"
+    print(f"sequence: {len(source)} pairs; {skipped}")
+    return source
+
+
+def _mask_source(
+    model: Path | None, masks: Path | None, camera: Camera, settings: SlamConfig, realtime: bool
+) -> MaskFolder | SegmenterMasks | None:
+    """Return the source of masks; in real time the segmenter runs on one thread."""
+    if masks is not None:
+        return MaskFolder(masks, camera, settings.masks)
+    if model is None:
+        return None
+    from cohdc_train.segmenter import Segmenter
+
+    return SegmenterMasks(Segmenter(model, 1 if realtime else 0), settings.masks)
+
+
+def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers | None) -> Slam:
+    """Build the SLAM system, in real time with the workers."""
+    if workers is None:
+        return Slam(camera, settings)
+    return Slam(
+        camera,
+        settings,
+        executor=workers.executor,
+        frame_time_used=workers.source.frame_time_used,
+    )
+
+
+def _config_text(
+    inputs: dict[str, Path | None], camera: Camera, settings: SlamConfig, options: RunOptions
+) -> str:
+    """Return config.yaml, which `cohdc slam --config` reads; version and camera are comments."""
+    content = {name: None if path is None else str(path) for name, path in inputs.items()}
+    content |= as_plain(asdict(options)) | {"settings": as_plain(asdict(settings))}
+    intrinsics = " ".join(f"{name}={value:g}" for name, value in camera.as_dict().items())
+    head = f"# cohdc {__version__}\n# camera: {intrinsics}\n"
+    return head + yaml.safe_dump(content, sort_keys=False)

@@ -129,7 +129,7 @@ class Slam:
         )
         has_flow = executor is not None and config.flow.enabled
         refiner = PatchRefiner(self.map, config.refinement) if config.refinement.enabled else None
-        free_space = FreeSpaceChecker(camera)
+        free_space = FreeSpaceChecker(camera, config.free_space, config.surfaces)
         return TrackerParts(
             point_map=self.map,
             extractor=extractor,
@@ -148,9 +148,7 @@ class Slam:
             ),
             history=FrameHistory(),
             intermediate_frames=(
-                self._new_intermediate_frames()
-                if config.bundle_adjustment.use_all_frames
-                else None
+                self._new_intermediate_frames() if config.bundle_adjustment.use_all_frames else None
             ),
         )
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, publish
@@ -70,12 +69,12 @@ def write_run(
     records: list[FrameRecord],
     trajectory: Trajectory,
     metrics: dict[str, Any],
-    config: dict[str, Any],
+    config: str,
 ) -> None:
     """Write trajectory.txt, metrics.json, frames.csv and config.yaml into an existing folder."""
     write_tum(folder / "trajectory.txt", trajectory)
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+    (folder / "config.yaml").write_text(config, encoding="utf-8")
     with (folder / "frames.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(

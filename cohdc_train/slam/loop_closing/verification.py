@@ -98,9 +98,7 @@ class LoopVerifier:
             return None
         T_cw, inliers = rough, 0
         for radius in (10.0, 5.0):
-            matches = match_projected(
-                world.project(place, T_cw), features, radius, self._matching
-            )
+            matches = match_projected(world.project(place, T_cw), features, radius, self._matching)
             seen = observations(features, matches.keypoints)
             T_cw, inlier = optimize_pose(
                 T_cw, world.positions[matches.points], seen, self._reprojection

@@ -106,7 +106,7 @@ class PacedSource:
         if first is None:
             return
         yield first
-        start = self._clock.now() - first.t  # the moment at which stamps were 0
+        start = self._clock.now() - first.timestamp  # the moment at which stamps were 0
         self._reader = threading.Thread(
             target=self._read, args=(views, start), name="reader", daemon=True
         )
@@ -123,7 +123,9 @@ class PacedSource:
             for view in views:
                 due = self._clock.now()
                 if len(self):
-                    self.playback_delay_s = max(self.playback_delay_s, due - (start + view.timestamp))
+                    self.playback_delay_s = max(
+                        self.playback_delay_s, due - (start + view.timestamp)
+                    )
                     due = start + view.timestamp + self.playback_delay_s
                     self._clock.wait_until(due)
                 if self._stop.is_set():

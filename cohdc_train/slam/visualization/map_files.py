@@ -56,6 +56,6 @@ class MapFiles:
             cloud = fuse(self._images, frames, point_map.camera, _VOXEL)
             write_ply(self._folder / "cloud.ply", cloud.points, cloud.colors)
         if len(trajectory):
-            picture = render_top_view(cloud, list(trajectory.poses))
-            picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-            write_bytes(self._folder / "map.png", cv2.imencode(".png", picture)[1].tobytes())
+            image = render_top_view(cloud, list(trajectory.poses))
+            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            write_bytes(self._folder / "map.png", cv2.imencode(".png", bgr)[1].tobytes())

@@ -9,7 +9,6 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 from cohdc_train.slam.frame import FrameResult, RGBDFrame
@@ -119,9 +118,7 @@ class RerunViewer:
         self._start = frame.timestamp if self._start is None else self._start
         self._stream.set_time("time", duration=frame.timestamp - self._start)
         if T_wc is not None:
-            log(
-                "world/camera", rerun.Transform3D(translation=T_wc[:3, 3], mat3x3=T_wc[:3, :3])
-            )
+            log("world/camera", rerun.Transform3D(translation=T_wc[:3, 3], mat3x3=T_wc[:3, :3]))
         jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
         log("world/camera/image", rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if mask is not None:
