@@ -18,19 +18,30 @@ PoseSource = Literal["map", "flow"]
 class RGBDFrame:
     """Color image and depth image of one moment.
 
-    timestamp: s; timestamp_text: as the source writes it; name: of the color image without its
-    suffix, which a mask in a folder has, too; rgb: [H, W, 3] uint8 RGB; depth: [H, W] float32 m
-    along the optical axis, 0 = no reading; depth_timestamp: s, where it differs from timestamp;
-    depth_ms: time it took to compute the depth.
+    Args:
+        timestamp: s.
+        rgb: [H, W, 3] uint8 RGB.
+        depth: [H, W] float32 m along the optical axis, 0 = no reading.
+        depth_timestamp: s, where it differs from timestamp.
+        timestamp_text: timestamp as the source writes it; six decimals when not given.
+        name: of the color image without its suffix, which its mask in a folder has, too;
+            timestamp_text when not given.
+        depth_ms: time it took to compute the depth.
     """
 
     timestamp: float
-    timestamp_text: str
-    name: str
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     depth_timestamp: float | None = None
+    timestamp_text: str = ""
+    name: str = ""
     depth_ms: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.timestamp_text:
+            object.__setattr__(self, "timestamp_text", f"{self.timestamp:.6f}")
+        if not self.name:
+            object.__setattr__(self, "name", self.timestamp_text)
 
 
 @dataclass(frozen=True)

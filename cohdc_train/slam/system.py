@@ -16,7 +16,7 @@ from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameResult, PoseCallback, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import inverse
-from cohdc_train.slam.loop_closing.loop_closer import LoopCloser
+from cohdc_train.slam.loop_closing.loop_closer import LoopCloser, LoopCloserConfig
 from cohdc_train.slam.mapping.frame_history import FrameHistory
 from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames
 from cohdc_train.slam.mapping.local_mapper import LocalMapper, LocalMapperConfig
@@ -129,7 +129,7 @@ class Slam:
         )
         has_flow = executor is not None and config.flow.enabled
         refiner = PatchRefiner(self.map, config.refinement) if config.refinement.enabled else None
-        free_space = FreeSpaceChecker(camera)
+        free_space = FreeSpaceChecker(camera, config.free_space, config.surfaces)
         return TrackerParts(
             point_map=self.map,
             extractor=extractor,
@@ -148,9 +148,7 @@ class Slam:
             ),
             history=FrameHistory(),
             intermediate_frames=(
-                self._new_intermediate_frames()
-                if config.bundle_adjustment.use_all_frames
-                else None
+                self._new_intermediate_frames() if config.bundle_adjustment.use_all_frames else None
             ),
         )
 
@@ -161,9 +159,14 @@ class Slam:
         config = self.config
         loop_closer = None
         if config.loops.enabled:
-            loop_closer = LoopCloser(
-                self.map, self._reprojection, config.seed, config.bundle_adjustment
+            loop_config = LoopCloserConfig(
+                config.loops,
+                config.loop_verification,
+                config.matching,
+                config.ransac,
+                config.bundle_adjustment,
             )
+            loop_closer = LoopCloser(self.map, self._reprojection, loop_config, config.seed)
         mapper_config = LocalMapperConfig(
             config.bundle_adjustment,
             config.keyframe_culling,

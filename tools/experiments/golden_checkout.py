@@ -14,7 +14,12 @@ from typing import NamedTuple
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 # Options of `cohdc slam` and of tools that got another name. The cases use the old one.
+# Old name: new name; an empty one for an option whose value became positional.
 RENAMED_OPTIONS = {
+    "--sequence": "",
+    "--seed": "--settings.seed",
+    "--view": "--viewer",
+    "--idle": "--idle_timeout",
     "--cloud": "--dense_cloud",
     "--features": "--settings.features.max_keypoints",
     "--culling.dynamic_classes": "--settings.masks.dynamic_classes",
@@ -133,7 +138,8 @@ def translate(arguments: list[str], help_text: str) -> list[str]:
     """Replace old names of options that a help text does not know by their new names."""
     known = set(re.findall(r"--[\w.]+", help_text))
     renames = {old: new for old, new in RENAMED_OPTIONS.items() if old not in known}
-    return [renames.get(word, word) for word in arguments]
+    words = [renames.get(word, word) for word in arguments]
+    return [word for word in words if word]
 
 
 @contextmanager

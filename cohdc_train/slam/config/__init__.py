@@ -15,15 +15,7 @@ from cohdc_train.slam.config.mapping import (
     MappingConfig,
     SmoothingConfig,
 )
-from cohdc_train.slam.config.method import (
-    ACCELERATION,
-    FEW,
-    LONGEST,
-    MAX_KEYPOINTS,
-    SHORTEST,
-    Culling,
-    Method,
-)
+from cohdc_train.slam.config.reading import as_plain
 from cohdc_train.slam.config.sensors import DenseCloudConfig, StereoConfig
 from cohdc_train.slam.config.slam_config import SlamConfig
 from cohdc_train.slam.config.tracking import (
@@ -36,13 +28,7 @@ from cohdc_train.slam.config.tracking import (
 )
 
 __all__ = [
-    "ACCELERATION",
-    "FEW",
-    "LONGEST",
-    "MAX_KEYPOINTS",
-    "SHORTEST",
     "BundleAdjustmentConfig",
-    "Culling",
     "DenseCloudConfig",
     "DepthConfig",
     "FeatureConfig",
@@ -55,7 +41,6 @@ __all__ = [
     "MappingConfig",
     "MaskConfig",
     "MatchingConfig",
-    "Method",
     "MotionModelConfig",
     "MotionSegmentationConfig",
     "RansacConfig",
@@ -66,4 +51,5 @@ __all__ = [
     "StereoConfig",
     "SurfaceConfig",
     "TrackingConfig",
+    "as_plain",
 ]

@@ -31,6 +31,19 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
+def as_plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as YAML holds them: tuples become lists, and paths text."""
+    result: dict[str, Any] = {}
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            result[name] = as_plain(value)
+        elif isinstance(value, tuple):
+            result[name] = list(value)
+        else:
+            result[name] = str(value) if isinstance(value, Path) else value
+    return result
+
+
 def nested(options: Mapping[str, object]) -> dict[str, Any]:
     """Turn dotted names into nested mappings: {"a.b": 1} becomes {"a": {"b": 1}}."""
     result: dict[str, Any] = {}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.config import MaskConfig
 from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 
 Floats = NDArray[np.float32]
 
@@ -217,7 +217,7 @@ class SegmentationJob:
     """
 
     number: int
-    view: View
+    view: RGBDFrame
     half: HalfResFrame
 
 
@@ -234,7 +234,7 @@ class PropagatedMask:
         self._dilation_px = 0.0
         self._propagator = MaskPropagator(config)
 
-    def advance(self, view: View) -> SegmentationJob:
+    def advance(self, view: RGBDFrame) -> SegmentationJob:
         """Propagate the mask to the next frame. Returns a job to segment this frame."""
         half = downsample(view.rgb, view.depth)
         return SegmentationJob(self._propagator.advance(half), view, half)
@@ -251,7 +251,7 @@ class PropagatedMask:
         self._dilation_px = dilation_px
         self._propagator.update(mask, job.number, job.half)
 
-    def mask(self, view: View) -> Mask:
+    def mask(self, view: RGBDFrame) -> Mask:
         """Return the dilated mask [H, W] bool at the newest frame; all False before the first mask.
 
         view: the newest frame, for its size.

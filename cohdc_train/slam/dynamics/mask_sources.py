@@ -10,14 +10,14 @@ import numpy as np
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import MaskConfig
 from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.tum import read_mask
 
 if TYPE_CHECKING:  # it loads onnxruntime, which a run without a model does not need
     from cohdc_train.segmenter import Detections, Segmenter
 
-MaskSource = Callable[[View], Mask | None]
+MaskSource = Callable[[RGBDFrame], Mask | None]
 
 
 def dynamic_mask(detections: "Detections", labels: frozenset[int], config: MaskConfig) -> Mask:
@@ -56,7 +56,7 @@ def dilation_for(config: MaskConfig, quality: float) -> float:
     return config.dilation_px * (1.0 + factor * doubt)
 
 
-def no_masks(view: View) -> Mask | None:
+def no_masks(view: RGBDFrame) -> Mask | None:
     """Return None, for sequences without moving objects or without a segmenter."""
     return None
 
@@ -72,7 +72,7 @@ class MaskFolder:
         self._camera = camera
         self._config = config
 
-    def __call__(self, view: View) -> Mask:
+    def __call__(self, view: RGBDFrame) -> Mask:
         """Read and dilate the mask of a frame.
 
         Returns:
@@ -83,7 +83,7 @@ class MaskFolder:
         """
         return dilate_mask(*self.segment(view))
 
-    def segment(self, view: View) -> tuple[Mask, float]:
+    def segment(self, view: RGBDFrame) -> tuple[Mask, float]:
         """Return the mask as the file holds it [H, W], and the dilation that is due, px."""
         return read_mask(self._folder / f"{view.name}.png", self._camera), self._config.dilation_px
 
@@ -114,11 +114,11 @@ class SegmenterMasks:
         self._segmenter = segmenter
         self._config = config
 
-    def __call__(self, view: View) -> Mask:
+    def __call__(self, view: RGBDFrame) -> Mask:
         """Segment a frame; returns the dilated mask [H, W] bool, True = dynamic."""
         return dynamic_mask(self._segmenter(view.rgb), self._labels, self._config)
 
-    def segment(self, view: View) -> tuple[Mask, float]:
+    def segment(self, view: RGBDFrame) -> tuple[Mask, float]:
         """Segment a frame without dilation.
 
         Returns:

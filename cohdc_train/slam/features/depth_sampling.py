@@ -40,4 +40,3 @@ def sample_depth(
         band = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), dtype=np.uint8))
         refused |= band[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0
     return np.where(refused, np.nan, center)
-

@@ -26,7 +26,7 @@ class OrbExtractor:
         self._detectors = [_orb(config, threshold) for threshold in config.fast_thresholds]
         self._latest = 0  # threshold that was low enough for the latest frame
         levels = np.arange(config.num_levels)
-        self._scales = config.scale_factor**levels
+        self._scales = self.pyramid.scales(levels)
         shares = config.scale_factor ** -levels.astype(np.float64)
         self._quota = np.ceil(shares / shares.sum() * config.max_keypoints).astype(np.int64)
 
@@ -50,7 +50,8 @@ class OrbExtractor:
         gray = gray_of(rgb)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found, table = self._detect(gray, allowed)
-        chosen = select_on_grid(table, self._quota, self.config.grid_cell_px * self._scales)
+        cell_px = self.config.grid_cell_px * self._scales
+        chosen = select_on_grid(table, self._quota, cell_px)
         kept, words = self._detectors[0].compute(gray, [found[i] for i in chosen])
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.live import LiveSource
 from cohdc_train.slam.io.sources import SequenceFormat
@@ -35,7 +35,7 @@ class GrowingSequence(LiveSource):
         self._layout = layout
         self._idle = idle
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         given = 0
         for first, second in self._pairs():
             try:

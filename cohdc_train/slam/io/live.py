@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.float32], float]
@@ -32,7 +32,7 @@ class LiveSource:
     def __len__(self) -> int:
         return 0
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         raise NotImplementedError
 
     def stop(self) -> None:
@@ -53,7 +53,7 @@ class LiveCamera(LiveSource):
         super().__init__(camera)
         self._frames = frames
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         last = -np.inf
         for frame in self._frames:
             if self._stopped.is_set():
@@ -69,14 +69,9 @@ class LiveCamera(LiveSource):
                 )
             if not t > last:
                 raise DataError(f"live frame at {t:.6f} s does not come after {last:.6f} s")
-            last, stamp = t, f"{t:.6f}"
-            yield View(
-                t,
-                stamp,
-                stamp,
-                rgb.copy(),
-                np.nan_to_num(depth_m, nan=0.0, posinf=0.0).astype(np.float32),
-            )
+            last = t
+            depth = np.nan_to_num(depth_m, nan=0.0, posinf=0.0).astype(np.float32)
+            yield RGBDFrame(t, rgb.copy(), depth)
 
 
 @contextmanager

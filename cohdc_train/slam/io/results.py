@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, publish
@@ -33,21 +32,22 @@ def compute_metrics(
     over keyframes only, `depth` of stereo pairs only; `fps` is frames over the time of all stages.
     Errors are absent without a truth, and, which is told on stderr, where it is of another time.
     """
-    poses = [record.pose for record in records]
-    depth = [record.depth_ms for record in records]
+    timings = [record.timing for record in records]
+    depth = [timing.depth_ms for timing in timings]
     times = ({"depth": depth} if any(depth) else {}) | {
-        "segment": [record.segment_ms for record in records],
-        "track": [pose.track_ms for pose in poses],
-        "map": [pose.map_ms for pose in poses if pose.keyframe],
+        "segment": [timing.mask_ms for timing in timings],
+        "track": [timing.tracking_ms for timing in timings],
+        "map": [record.timing.mapping_ms for record in records if record.is_keyframe],
     }
-    tracked = sum(pose.tracked for pose in poses)
+    tracked = sum(record.is_tracked for record in records)
     busy = sum(sum(row) for row in times.values())
+    num_frames = len(records) + dropped
     result: dict[str, Any] = {
-        "frames": len(poses) + dropped,
+        "frames": num_frames,
         "tracked": tracked,
-        "coverage": tracked / (len(poses) + dropped),
-        "keyframes": sum(pose.keyframe for pose in poses),
-        "fps": 1e3 * len(poses) / busy,
+        "coverage": tracked / num_frames,
+        "keyframes": sum(record.is_keyframe for record in records),
+        "fps": 1e3 * len(records) / busy,
         "ms": {stage: quantiles(row) for stage, row in times.items()},
     }
     if truth is not None and tracked >= 3:
@@ -69,12 +69,12 @@ def write_run(
     records: list[FrameRecord],
     trajectory: Trajectory,
     metrics: dict[str, Any],
-    config: dict[str, Any],
+    config: str,
 ) -> None:
     """Write trajectory.txt, metrics.json, frames.csv and config.yaml into an existing folder."""
     write_tum(folder / "trajectory.txt", trajectory)
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+    (folder / "config.yaml").write_text(config, encoding="utf-8")
     with (folder / "frames.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(
@@ -90,11 +90,17 @@ def write_run(
             ]
         )
         for record in records:
-            pose = record.pose
-            times = [f"{ms:.2f}" for ms in (record.segment_ms, pose.track_ms, pose.map_ms)]
-            culled = f"{record.culled:.4f}"
+            timing = record.timing
+            times = (timing.mask_ms, timing.tracking_ms, timing.mapping_ms)
             writer.writerow(
-                [record.stamp, int(pose.tracked), int(pose.keyframe), pose.inliers, culled, *times]
+                [
+                    record.timestamp_text,
+                    int(record.is_tracked),
+                    int(record.is_keyframe),
+                    record.num_matches,
+                    f"{record.masked_ratio:.4f}",
+                    *(f"{ms:.2f}" for ms in times),
+                ]
             )
 
 

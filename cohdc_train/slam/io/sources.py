@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.tum import TimestampedImage, read_depth, read_pairs, read_rgb
 
@@ -27,7 +27,7 @@ class FrameSource(Protocol):
         """How many views will come, 0 where nobody knows."""
         ...
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         """The views. Raises DataError naming the file that cannot be used."""
         ...
 
@@ -43,15 +43,16 @@ class SequenceFormat:
     first: str
     second: str
     max_difference: float
-    view: Callable[[TimestampedImage, TimestampedImage], View]
+    view: Callable[[TimestampedImage, TimestampedImage], RGBDFrame]
 
 
 def rgbd_format(camera: Camera) -> SequenceFormat:
     """TUM's layout: rgb.txt and depth.txt."""
 
-    def view(color: TimestampedImage, depth: TimestampedImage) -> View:
+    def view(color: TimestampedImage, depth: TimestampedImage) -> RGBDFrame:
         rgb, meters = read_rgb(color.image, camera), read_depth(depth.image, camera)
-        return View(color.t, color.stamp, color.image.stem, rgb, meters, depth.t)
+        name = color.image.stem
+        return RGBDFrame(color.t, rgb, meters, depth.t, timestamp_text=color.stamp, name=name)
 
     return SequenceFormat("rgb.txt", "depth.txt", 0.02, view)
 
@@ -74,6 +75,6 @@ class RecordedSequence:
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         for first, second in self._pairs:
             yield self._layout.view(first, second)

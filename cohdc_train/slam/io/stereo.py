@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.sources import SequenceFormat
 from cohdc_train.slam.io.tum import TimestampedImage, read_rgb
@@ -95,17 +95,18 @@ def stereo_format(camera: Camera) -> SequenceFormat:
     """
     matcher = StereoMatcher(camera)
 
-    def view(left: TimestampedImage, right: TimestampedImage) -> View:
+    def view(left: TimestampedImage, right: TimestampedImage) -> RGBDFrame:
         pair = read_rgb(left.image, camera), read_rgb(right.image, camera)
         start = time.perf_counter()
         depth = matcher(*pair)
-        return View(
+        depth_ms = 1e3 * (time.perf_counter() - start)
+        return RGBDFrame(
             left.t,
-            left.stamp,
-            left.image.stem,
             pair[0],
             depth,
-            depth_ms=1e3 * (time.perf_counter() - start),
+            timestamp_text=left.stamp,
+            name=left.image.stem,
+            depth_ms=depth_ms,
         )
 
     return SequenceFormat("left.txt", "right.txt", _MAX_DIFFERENCE, view)

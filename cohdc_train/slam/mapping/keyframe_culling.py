@@ -9,6 +9,7 @@ from cohdc_train.slam.config import KeyframeCullingConfig
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.map_points import drop_points
+
 _UNSEEN = 100  # level of a point that a keyframe does not observe
 
 

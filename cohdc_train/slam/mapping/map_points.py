@@ -22,7 +22,9 @@ def fuse(world: Map, keyframe: Keyframe) -> None:
     older point.
     """
     ids = keyframe.seen_points()
-    neighbors = [k for k in world.covisible(ids, world.config.fuse_keyframes + 1) if k is not keyframe]
+    neighbors = [
+        k for k in world.covisible(ids, world.config.fuse_keyframes + 1) if k is not keyframe
+    ]
     pairs = [_look_for(world, ids, other) for other in neighbors]
     if pairs:
         _merge(world, np.concatenate(pairs, axis=1), [keyframe, *neighbors])

@@ -19,11 +19,11 @@ from cohdc_train.slam.dynamics.mask_propagation import (
     downsample_mask,
 )
 from cohdc_train.slam.dynamics.masks import Mask
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.runtime.executors import NICE
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
 
-SegmentFunction = Callable[[View], tuple[Mask, float]]
+SegmentFunction = Callable[[RGBDFrame], tuple[Mask, float]]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class AsyncSegmenter:
         self._jobs.close()
         self._worker.join()
 
-    def __call__(self, view: View) -> Mask:
+    def __call__(self, view: RGBDFrame) -> Mask:
         """[H, W] bool, True = dynamic. Views must come in the order of time; raises what the
         segmenter raised.
         """
@@ -82,7 +82,7 @@ class AsyncSegmenter:
         if self._carried.newest is None:
             self._take(self._results.take())
         assert self._carried.newest is not None
-        self.ages.append(view.t - self._carried.newest.view.t)
+        self.ages.append(view.timestamp - self._carried.newest.view.timestamp)
         return self._carried.mask(view)
 
     def _take(self, done: _Done | None) -> None:

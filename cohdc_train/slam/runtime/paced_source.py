@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.sources import FrameSource
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
@@ -60,7 +60,7 @@ class PacedSource:
         self.playback_delay_s = 0.0
         self._source = source
         self._clock = clock or WallClock()
-        self._slot: LatestSlot[tuple[View, float]] = LatestSlot()
+        self._slot: LatestSlot[tuple[RGBDFrame, float]] = LatestSlot()
         self._stop = threading.Event()
         self._reader: threading.Thread | None = None
         self._due = 0.0  # when the view was that was given out last
@@ -100,13 +100,13 @@ class PacedSource:
         if self._reader is not None:
             self._reader.join(timeout=2.0)  # a camera that gives nothing more may hold it for ever
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         views = iter(self._source)
         first = next(views, None)
         if first is None:
             return
         yield first
-        start = self._clock.now() - first.t  # the moment at which stamps were 0
+        start = self._clock.now() - first.timestamp  # the moment at which stamps were 0
         self._reader = threading.Thread(
             target=self._read, args=(views, start), name="reader", daemon=True
         )
@@ -117,14 +117,16 @@ class PacedSource:
             yield view
             self.mark_answered()
 
-    def _read(self, views: Iterator[View], start: float) -> None:
+    def _read(self, views: Iterator[RGBDFrame], start: float) -> None:
         before = float("-inf")
         try:
             for view in views:
                 due = self._clock.now()
                 if len(self):
-                    self.playback_delay_s = max(self.playback_delay_s, due - (start + view.t))
-                    due = start + view.t + self.playback_delay_s
+                    self.playback_delay_s = max(
+                        self.playback_delay_s, due - (start + view.timestamp)
+                    )
+                    due = start + view.timestamp + self.playback_delay_s
                     self._clock.wait_until(due)
                 if self._stop.is_set():
                     return

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, MaskSource, SegmenterMasks, no_masks
-from cohdc_train.slam.frame import Pose, PoseCallback
+from cohdc_train.slam.frame import FrameResult, PoseCallback
 from cohdc_train.slam.io.results import quantiles
 from cohdc_train.slam.io.sources import FrameSource
 from cohdc_train.slam.runtime.async_masks import AsyncSegmenter
@@ -35,10 +35,10 @@ class RealtimeWorkers:
     def report_latency(self, on_pose: PoseCallback | None) -> PoseCallback:
         """The same, after the source has learnt that there is an answer."""
 
-        def mark_answered(pose: Pose) -> None:
+        def mark_answered(result: FrameResult) -> None:
             self.source.mark_answered()
             if on_pose is not None:
-                on_pose(pose)
+                on_pose(result)
 
         return mark_answered
 

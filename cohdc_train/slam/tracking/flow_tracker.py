@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.config import FlowConfig
-from cohdc_train.slam.features.keypoints import Features, Keypoints
+from cohdc_train.slam.features.keypoints import Keypoints
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.features.orb import gray_of
 from cohdc_train.slam.frame import RGBDFrame

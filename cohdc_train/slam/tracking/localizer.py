@@ -111,7 +111,13 @@ class Localizer:
         if segments_motion:
             num_found = self.map.found[ids]
             T_cw, inlier, moving = estimate_static_pose(
-                estimate.T_cw, points, seen, self._reprojection, num_found, estimate.prior
+                estimate.T_cw,
+                points,
+                seen,
+                self._reprojection,
+                num_found,
+                estimate.prior,
+                self._config.motion_segmentation,
             )
         else:
             T_cw, inlier = optimize_pose(

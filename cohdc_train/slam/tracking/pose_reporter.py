@@ -44,7 +44,7 @@ class PoseReporter:
         known_s = now if self._known_s is None else self._known_s
         tracking_ms, mapping_ms = 1e3 * (known_s - self._start_s), 1e3 * (now - known_s)
         estimate = result if isinstance(result, PoseEstimate) else None
-        frame_features = result if estimate is None else estimate.frame_features
+        frame_features = result.frame_features if isinstance(result, PoseEstimate) else result
         return FrameResult(
             timestamp=self._frame.timestamp,
             T_wc=None if estimate is None else inverse(estimate.T_cw),

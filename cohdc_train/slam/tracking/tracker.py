@@ -153,9 +153,7 @@ class Tracker:
         if self.parts.flow is None or self.state.flow is None:
             return True
         in_hurry = time_used > self._realtime.match_until
-        return self.parts.flow.needs_match(
-            self.state.flow, in_hurry, not self.parts.mapper.is_idle
-        )
+        return self.parts.flow.needs_match(self.state.flow, in_hurry, not self.parts.mapper.is_idle)
 
     def _finish_flow_frame(
         self, frame: RGBDFrame, estimate: PoseEstimate, time_used: float

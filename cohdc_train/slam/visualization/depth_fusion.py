@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.masks import dilate_mask
-from cohdc_train.slam.frame import FrameRecord, View
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera, undistortion_maps
 from cohdc_train.slam.geometry.se3 import Array, to_local
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.visualization.point_cloud import PointCloud
 from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
@@ -52,16 +52,12 @@ class KeyframeImages:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def __call__(
-        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
-    ) -> None:
+    def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
         """Keep the frame when it became a keyframe."""
-        if not record.pose.keyframe:
+        if not result.is_keyframe:
             return
-        rgb, depth = (
-            view.rgb,
-            np.minimum(remove_dynamic_depth(view.depth, mask), 65_535 / self._units),
-        )
+        static_depth = remove_dynamic_depth(frame.depth, result.union_mask)
+        rgb, depth = frame.rgb, np.minimum(static_depth, 65_535 / self._units)
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
@@ -69,7 +65,7 @@ class KeyframeImages:
         units = np.rint(depth * self._units).astype(np.uint16)
         png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         self._file.write(jpeg + png)
-        self._index.append((view.t, len(jpeg), len(png)))
+        self._index.append((frame.timestamp, len(jpeg), len(png)))
 
     def __iter__(self) -> Iterator[Frame]:
         """(t s, colour [H, W, 3] RGB, unmasked depth [H, W] m, 0 = none) of every keyframe, without

@@ -5,18 +5,17 @@ from pathlib import Path
 from typing import Self
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.files import write_bytes
-from cohdc_train.slam.frame import FrameRecord, View
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.io.ply import write_ply
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.visualization.depth_fusion import KeyframeImages, fuse
 from cohdc_train.slam.visualization.point_cloud import PointColorRecorder
 from cohdc_train.slam.visualization.top_view import render_top_view
+from cohdc_train.trajectory.trajectory import Trajectory
 
 _VOXEL = 0.01  # m
 
@@ -38,25 +37,25 @@ class MapFiles:
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def __call__(
-        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
-    ) -> None:
+    def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
         """Note colours of points, and keep the pictures of keyframes for the cloud."""
-        self._colors(view, mask, record, tracker)
+        self._colors(frame, result, point_map)
         if self._images is not None:
-            self._images(view, mask, record, tracker)
+            self._images(frame, result, point_map)
 
-    def write(self, tracker: Tracker) -> None:
-        """Write the files, with keyframes and points where the map has them now."""
-        cloud = self._colors.cloud(tracker.map)
+    def write(self, point_map: Map, trajectory: Trajectory) -> None:
+        """Write the files, with keyframes and points where the map has them now.
+
+        trajectory: of all tracked frames, keyframes that left the map too.
+        """
+        cloud = self._colors.cloud(point_map)
         write_ply(self._folder / "map.ply", cloud.points, cloud.colors)
-        stamps, poses = tracker.trajectory()
         if self._images is not None:
-            frames = dict(
-                zip(stamps.tolist(), inverse(poses), strict=True)
-            )  # with keyframes that left the map
-            cloud = fuse(self._images, frames, tracker.camera, _VOXEL)
+            T_cw = inverse(trajectory.poses)
+            frames = dict(zip(trajectory.stamps.tolist(), T_cw, strict=True))
+            cloud = fuse(self._images, frames, point_map.camera, _VOXEL)
             write_ply(self._folder / "cloud.ply", cloud.points, cloud.colors)
-        if len(poses):
-            picture = cv2.cvtColor(render_top_view(cloud, list(poses)), cv2.COLOR_RGB2BGR)
-            write_bytes(self._folder / "map.png", cv2.imencode(".png", picture)[1].tobytes())
+        if len(trajectory):
+            image = render_top_view(cloud, list(trajectory.poses))
+            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            write_bytes(self._folder / "map.png", cv2.imencode(".png", bgr)[1].tobytes())

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.frame import FrameRecord, View
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.tracking.tracker import Tracker
 
 _SEEN_BY = 3  # keyframes that confirm a point
 
@@ -32,16 +31,14 @@ class PointColorRecorder:
     def __init__(self) -> None:
         self._colors: dict[float, NDArray[np.uint8]] = {}  # t of a keyframe -> [corners, 3] RGB
 
-    def __call__(
-        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
-    ) -> None:
+    def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
         """Note the colours when the frame became a keyframe, and forget those of keyframes that
         left the map.
         """
-        if record.pose.keyframe and tracker.features is not None:
-            columns, rows = np.rint(tracker.features.pixels).astype(np.int64).T
-            self._colors[view.t] = view.rgb[rows, columns]
-            there = {keyframe.t for keyframe in tracker.map.keyframes}
+        if result.is_keyframe and result.features is not None:
+            columns, rows = np.rint(result.features.pixels).astype(np.int64).T
+            self._colors[frame.timestamp] = frame.rgb[rows, columns]
+            there = {keyframe.t for keyframe in point_map.keyframes}
             self._colors = {t: colors for t, colors in self._colors.items() if t in there}
 
     def cloud(self, world: Map) -> PointCloud:

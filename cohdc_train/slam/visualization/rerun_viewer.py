@@ -9,12 +9,11 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.errors import CohdcError, MissingExtraError
-from cohdc_train.slam.frame import FrameRecord, View
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.visualization.point_cloud import PointColorRecorder
 
 _LAST = 5.0  # s that rerun has for the rest when a run is over
@@ -113,34 +112,29 @@ class RerunViewer:
         elif self._file is not None:
             self._part().unlink(missing_ok=True)
 
-    def __call__(
-        self, view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
-    ) -> None:
+    def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
         """Show a frame; the map and the way when it became a keyframe."""
-        rerun, log, pose = self._rerun, self._stream.log, record.pose
-        self._start = view.t if self._start is None else self._start
-        self._stream.set_time("time", duration=view.t - self._start)
-        if pose.T_wc is not None:
-            log(
-                "world/camera",
-                rerun.Transform3D(translation=pose.T_wc[:3, 3], mat3x3=pose.T_wc[:3, :3]),
-            )
-        jpeg = cv2.imencode(".jpg", cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
+        rerun, log, T_wc, mask = self._rerun, self._stream.log, result.T_wc, result.union_mask
+        self._start = frame.timestamp if self._start is None else self._start
+        self._stream.set_time("time", duration=frame.timestamp - self._start)
+        if T_wc is not None:
+            log("world/camera", rerun.Transform3D(translation=T_wc[:3, 3], mat3x3=T_wc[:3, :3]))
+        jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
         log("world/camera/image", rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if mask is not None:
             log("world/camera/mask", rerun.SegmentationImage(mask.astype(np.uint8), opacity=0.5))
         times = {
-            "segment": record.segment_ms,
-            "track": pose.track_ms,
-            "map": pose.map_ms,
-            "depth": record.depth_ms,
+            "segment": result.timing.mask_ms,
+            "track": result.timing.tracking_ms,
+            "map": result.timing.mapping_ms,
+            "depth": result.timing.depth_ms,
         }
         for stage, ms in times.items():
             if ms > 0:
                 log(f"ms/{stage}", rerun.Scalars(ms))
-        log("inliers", rerun.Scalars(pose.inliers))
-        self._colors(view, mask, record, tracker)
-        if pose.keyframe:
-            cloud = self._colors.cloud(tracker.map)
+        log("inliers", rerun.Scalars(result.num_inliers))
+        self._colors(frame, result, point_map)
+        if result.is_keyframe:
+            cloud = self._colors.cloud(point_map)
             log("world/points", rerun.Points3D(cloud.points, colors=cloud.colors, radii=0.006))
-            log("world/way", rerun.LineStrips3D([tracker.map.way()[:, :3, 3]], colors=[_WAY]))
+            log("world/way", rerun.LineStrips3D([point_map.way()[:, :3, 3]], colors=[_WAY]))
