@@ -145,7 +145,9 @@ def run_slam(
         with ExitStack() as stack:
             workers = None
             if options.realtime:
-                workers = stack.enter_context(start_workers(source, make_masks))
+                workers = stack.enter_context(
+                    start_workers(source, make_masks, settings.masks, settings.realtime)
+                )
             slam_system = _build_slam(source.camera, settings, workers)
             files = stack.enter_context(_map_files(source.camera, part, settings, options))
             watching: list[RunObserver] = [files, *observers]
