@@ -169,12 +169,14 @@ def run_slam(
         with ExitStack() as stack:
             workers = None
             if options.realtime:
-                workers = stack.enter_context(start_workers(source, make_masks))
+                workers = stack.enter_context(
+                    start_workers(source, make_masks, settings.masks, settings.realtime)
+                )
             slam_system = _build_slam(source.camera, settings, workers)
-            files = stack.enter_context(MapFiles(source.camera, part, options.dense_cloud))
+            files = stack.enter_context(_map_files(source.camera, part, settings, options))
             watching: list[RunObserver] = [files, *observers]
             if options.viewer or options.rrd is not None:
-                viewer = RerunViewer(source.camera, options.viewer, options.rrd)
+                viewer = RerunViewer(source.camera, files.colors, options.viewer, options.rrd)
                 watching.append(stack.enter_context(viewer))
             stack.enter_context(stop_on_sigint(source))
             tracked = track_sequence(
@@ -259,6 +261,12 @@ def _mask_source(
     from cohdc_train.segmenter import Segmenter
 
     return SegmenterMasks(Segmenter(model, 1 if realtime else 0), settings.masks)
+
+
+def _map_files(camera: Camera, folder: Path, settings: SlamConfig, options: RunOptions) -> MapFiles:
+    """Return the recorder of the map's files."""
+    max_depth_m = settings.depth.limit_m(camera.baseline)
+    return MapFiles(camera, folder, options.dense_cloud, max_depth_m, settings.dense_cloud)
 
 
 def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers | None) -> Slam:

@@ -212,12 +212,12 @@ class SegmentationJob:
 
     Attributes:
         number: of the frame, as `MaskPropagator.advance` counts.
-        view: the frame.
+        frame: at full size.
         half: the frame at half size.
     """
 
     number: int
-    view: RGBDFrame
+    frame: RGBDFrame
     half: HalfResFrame
 
 
@@ -234,10 +234,10 @@ class PropagatedMask:
         self._dilation_px = 0.0
         self._propagator = MaskPropagator(config)
 
-    def advance(self, view: RGBDFrame) -> SegmentationJob:
+    def advance(self, frame: RGBDFrame) -> SegmentationJob:
         """Propagate the mask to the next frame. Returns a job to segment this frame."""
-        half = downsample(view.rgb, view.depth)
-        return SegmentationJob(self._propagator.advance(half), view, half)
+        half = downsample(frame.rgb, frame.depth)
+        return SegmentationJob(self._propagator.advance(half), frame, half)
 
     def update(self, job: SegmentationJob, mask: Mask, dilation_px: float) -> None:
         """Replace the mask by that of a finished job.
@@ -251,12 +251,12 @@ class PropagatedMask:
         self._dilation_px = dilation_px
         self._propagator.update(mask, job.number, job.half)
 
-    def mask(self, view: RGBDFrame) -> Mask:
+    def mask(self, frame: RGBDFrame) -> Mask:
         """Return the dilated mask [H, W] bool at the newest frame; all False before the first mask.
 
-        view: the newest frame, for its size.
+        frame: the newest frame, for its size.
         """
-        height, width = view.rgb.shape[:2]
+        height, width = frame.rgb.shape[:2]
         mask = self._propagator.mask()
         if mask is None:
             return np.zeros((height, width), dtype=np.bool_)

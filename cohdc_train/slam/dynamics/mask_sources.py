@@ -56,7 +56,7 @@ def dilation_for(config: MaskConfig, quality: float) -> float:
     return config.dilation_px * (1.0 + factor * doubt)
 
 
-def no_masks(view: RGBDFrame) -> Mask | None:
+def no_masks(frame: RGBDFrame) -> Mask | None:
     """Return None, for sequences without moving objects or without a segmenter."""
     return None
 
@@ -72,7 +72,7 @@ class MaskFolder:
         self._camera = camera
         self._config = config
 
-    def __call__(self, view: RGBDFrame) -> Mask:
+    def __call__(self, frame: RGBDFrame) -> Mask:
         """Read and dilate the mask of a frame.
 
         Returns:
@@ -81,11 +81,11 @@ class MaskFolder:
         Raises:
             DataError: the file is missing, for a person without a mask would spoil the map.
         """
-        return dilate_mask(*self.segment(view))
+        return dilate_mask(*self.segment(frame))
 
-    def segment(self, view: RGBDFrame) -> tuple[Mask, float]:
+    def segment(self, frame: RGBDFrame) -> tuple[Mask, float]:
         """Return the mask as the file holds it [H, W], and the dilation that is due, px."""
-        return read_mask(self._folder / f"{view.name}.png", self._camera), self._config.dilation_px
+        return read_mask(self._folder / f"{frame.name}.png", self._camera), self._config.dilation_px
 
 
 class SegmenterMasks:
@@ -114,16 +114,16 @@ class SegmenterMasks:
         self._segmenter = segmenter
         self._config = config
 
-    def __call__(self, view: RGBDFrame) -> Mask:
+    def __call__(self, frame: RGBDFrame) -> Mask:
         """Segment a frame; returns the dilated mask [H, W] bool, True = dynamic."""
-        return dynamic_mask(self._segmenter(view.rgb), self._labels, self._config)
+        return dynamic_mask(self._segmenter(frame.rgb), self._labels, self._config)
 
-    def segment(self, view: RGBDFrame) -> tuple[Mask, float]:
+    def segment(self, frame: RGBDFrame) -> tuple[Mask, float]:
         """Segment a frame without dilation.
 
         Returns:
             The mask [H, W] bool, and the dilation in px that suits the mean quality of its objects.
         """
-        dynamic = select_dynamic(self._segmenter(view.rgb), self._labels, self._config)
+        dynamic = select_dynamic(self._segmenter(frame.rgb), self._labels, self._config)
         quality = float(dynamic.quality.mean()) if len(dynamic) else 1.0
         return np.asarray(dynamic.masks().any(axis=0)), dilation_for(self._config, quality)

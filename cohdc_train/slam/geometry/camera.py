@@ -47,14 +47,6 @@ class Camera:
     readout_s: float = 0.0
 
     @property
-    def max_depth_m(self) -> float:
-        """Largest depth, m, that is exact enough to create a map point.
-
-        A Kinect errs by 4 cm and more beyond 5 m; a stereo pair is trusted up to 40 baselines.
-        """
-        return 40 * self.baseline if self.baseline else 5.0
-
-    @property
     def distortion(self) -> NDArray[np.float64]:
         """Distortion coefficients [5] in OpenCV's order, all 0 for an ideal lens."""
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])

@@ -35,11 +35,19 @@ def open_sequence(folder: Path, camera: Path | None = None) -> FrameSource:
 
 
 def choose_format(
-    folder: Path, camera: Camera, stereo: StereoConfig = StereoConfig()
+    folder: Path, camera: Camera, config: StereoConfig = StereoConfig()
 ) -> SequenceFormat:
-    """Return the format of a folder: a stereo pair where it has left.txt, or no rgb.txt and the
-    camera has a baseline.
+    """Choose the format of a folder: a stereo pair or color with depth.
+
+    It is a stereo pair where there is left.txt, or no rgb.txt and the camera has a baseline.
+
+    Args:
+        folder: of the sequence.
+        camera: of its frames.
+        config: depth of a stereo pair.
     """
     has_color = (folder / "rgb.txt").is_file()
-    is_stereo = (folder / "left.txt").is_file() or (camera.baseline > 0 and not has_color)
-    return stereo_format(camera) if is_stereo else rgbd_format(camera)
+    has_left = (folder / "left.txt").is_file()
+    if has_left or (camera.baseline > 0 and not has_color):
+        return stereo_format(camera, config)
+    return rgbd_format(camera)

@@ -37,8 +37,8 @@ class LoopCloserLike(Protocol):
     def loop_keyframes(self) -> set[int]:
         """Indices of the keyframes that loops refer to."""
 
-    def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
-        """Look for a loop with the newest keyframe. Returns whether the map moved."""
+    def close(self, keyframe: Keyframe, image: DepthImage) -> None:
+        """Look for a loop with the newest keyframe. The map may move."""
 
     def forget(self, keyframe: Keyframe) -> None:
         """Forget a keyframe that the map gave up."""
