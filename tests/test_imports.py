@@ -247,6 +247,7 @@ SLAM_ROOMS = [
     "io",
     "dynamics",
     "tracking",
+    "system",
     "visualization",
     "runtime",
     "runner",
@@ -257,8 +258,9 @@ SLAM_APART = {
     "frame": {"optimization", "mapping", "loop_closing"},
     "io": {"features", "optimization", "mapping", "loop_closing"},
     "dynamics": {"loop_closing"},
-    "tracking": {"io"},
-    "runtime": {"visualization"},
+    "tracking": {"io", "loop_closing"},
+    "visualization": {"loop_closing", "tracking", "system"},
+    "runtime": {"loop_closing", "tracking", "system", "visualization"},
 }
 
 

@@ -5,10 +5,10 @@ import copy
 import numpy as np
 import pytest
 from loop_world import View, poor_view, way_round
-from plane_world import CAMERA
+from plane_world import CAMERA, slam_config, track
 
-from cohdc_train.slam.config import Method
-from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.config import BundleAdjustmentConfig
+from cohdc_train.slam.frame import FrameResult
 from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
 from cohdc_train.slam.loop_closing.verification import LoopConstraint, LoopVerifier
@@ -16,13 +16,13 @@ from cohdc_train.slam.mapping.global_bundle_adjustment import adjust_everything
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel, chi_square
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 180
 TRUTH = way_round(FRAMES)
-Run = tuple[Tracker, list[Pose]]
+Run = tuple[Slam, list[FrameResult]]
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +35,18 @@ def run(views: list[View], loops: bool) -> Run:
     """With corners on whole pixels, or it would not drift; the motion always starts from the latest
     frame's pose.
     """
-    tracker, poses = Tracker(CAMERA, features=200, method=Method(loops=loops, refinement=False)), []
+    slam, poses = (
+        Slam(CAMERA, slam_config(200, loops__enabled=loops, refinement__enabled=False)),
+        [],
+    )
     for index, (rgb, depth) in enumerate(views):
-        poses.append(tracker.track(rgb, depth, index / 30))
-        assert tracker._last is not None
-        from_last = tracker._motion.expected(index / 30).prior.T_cw @ inverse(tracker._last.T_cw)
+        poses.append(track(slam, rgb, depth, index / 30))
+        assert slam.tracker.state.last is not None
+        prediction = slam.tracker.parts.motion.predict(index / 30)
+        assert prediction is not None
+        from_last = prediction.prior.T_cw @ inverse(slam.tracker.state.last.T_cw)
         assert np.linalg.norm(from_last[:3, 3]) < 0.01, index
-    return tracker, poses
+    return slam, poses
 
 
 @pytest.fixture(scope="module")
@@ -54,15 +59,13 @@ def drifting(views: list[View]) -> Run:
     return run(views, loops=False)
 
 
-def ate(tracker: Tracker) -> float:
+def ate(slam: Slam) -> float:
     """RMSE, m."""
-    return score(Trajectory(np.arange(FRAMES) / 30, TRUTH), Trajectory(*tracker.trajectory()))[
-        "ate_m"
-    ]["rmse"]
+    return score(Trajectory(np.arange(FRAMES) / 30, TRUTH), slam.trajectory())["ate_m"]["rmse"]
 
 
 def test_closing_the_loop_takes_out_the_drift(drifting: Run, closed: Run) -> None:
-    assert all(pose.tracked for pose in closed[1])
+    assert all(pose.is_tracked for pose in closed[1])
     assert (closed[0].loops, drifting[0].loops) == (1, 0)
     assert ate(drifting[0]) > 0.03
     assert ate(closed[0]) < 0.5 * ate(drifting[0])
@@ -74,7 +77,7 @@ def test_the_camera_lands_on_the_closed_map_at_once(drifting: Run, closed: Run) 
     ]
     off = [float(np.linalg.norm(end[:3, 3])) for end in ends]
     assert off[1] < 0.3 * off[0]
-    assert min(pose.inliers for pose in closed[1][-8:]) > 60
+    assert min(pose.num_matches for pose in closed[1][-8:]) > 60
 
 
 def test_both_ends_of_a_loop_share_points(closed: Run) -> None:
@@ -108,13 +111,13 @@ def test_adjusting_everything_brings_displaced_keyframes_back(closed: Run) -> No
     twentieth.
     """
     world = copy.deepcopy(closed[0].map)
-    adjust_everything(world, ReprojectionModel(CAMERA))
+    adjust_everything(world, ReprojectionModel(CAMERA), BundleAdjustmentConfig())
     settled, best = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
     rng = np.random.default_rng(0)
     for keyframe in world.keyframes[1:]:
         keyframe.T_cw = exp_se3(0.002 * rng.standard_normal(6)) @ keyframe.T_cw
     displaced, worst = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
-    adjust_everything(world, ReprojectionModel(CAMERA))
+    adjust_everything(world, ReprojectionModel(CAMERA), BundleAdjustmentConfig())
     again = np.stack([keyframe.T_cw for keyframe in world.keyframes])
     np.testing.assert_array_equal(again[0], settled[0])
     assert np.abs(again - settled).mean() < 0.5 * np.abs(displaced - settled).mean()
@@ -124,12 +127,12 @@ def test_adjusting_everything_brings_displaced_keyframes_back(closed: Run) -> No
 def test_the_end_of_a_run_adjusts_everything_unless_told_otherwise(views: list[View]) -> None:
     poses = {}
     for wanted in (True, False):
-        tracker = Tracker(CAMERA, features=250, method=Method(global_adjustment=wanted))
+        slam = Slam(CAMERA, slam_config(250, bundle_adjustment__global_enabled=wanted))
         for index, (rgb, depth) in enumerate(views[:60]):
-            tracker.track(rgb, depth, index / 30)
-        before = tracker.trajectory()[1]
-        tracker.finish()
-        poses[wanted] = float(np.abs(tracker.trajectory()[1] - before).max())
+            track(slam, rgb, depth, index / 30)
+        before = slam.trajectory().poses
+        slam.finish()
+        poses[wanted] = float(np.abs(slam.trajectory().poses - before).max())
     assert poses[False] == 0.0
     assert 0.0 < poses[True] < 0.05
 
@@ -137,7 +140,7 @@ def test_the_end_of_a_run_adjusts_everything_unless_told_otherwise(views: list[V
 @pytest.mark.slow
 def test_same_views_same_bits(views: list[View], closed: Run) -> None:
     again, _ = run(views, loops=True)
-    assert again.trajectory()[1].tobytes() == closed[0].trajectory()[1].tobytes()
+    assert again.trajectory().poses.tobytes() == closed[0].trajectory().poses.tobytes()
 
 
 class TestVerification:
@@ -152,24 +155,24 @@ class TestVerification:
             for k in drifting[0].map.keyframes
         }
 
-    def verify(self, tracker: Tracker, pictures: dict[int, DepthImage]) -> LoopConstraint | None:
-        newest = tracker.map.keyframes[-1]
+    def verify(self, slam: Slam, pictures: dict[int, DepthImage]) -> LoopConstraint | None:
+        newest = slam.map.keyframes[-1]
         there = np.linalg.norm(TRUTH[:, :3, 3] - TRUTH[frame(newest), :3, 3], axis=1)
-        old = min(tracker.map.keyframes[:20], key=lambda k: float(there[frame(k)]))
-        return LoopVerifier(tracker.map, ReprojectionModel(CAMERA), np.random.default_rng(0))(
+        old = min(slam.map.keyframes[:20], key=lambda k: float(there[frame(k)]))
+        return LoopVerifier(slam.map, ReprojectionModel(CAMERA), np.random.default_rng(0))(
             newest, old, pictures
         )
 
     def test_gives_the_true_motion_not_the_drifted_one(
         self, drifting: Run, pictures: dict[int, DepthImage]
     ) -> None:
-        tracker = drifting[0]
-        loop = self.verify(tracker, pictures)
+        slam = drifting[0]
+        loop = self.verify(slam, pictures)
         assert loop is not None
-        assert loop.new[0] == tracker.map.keyframes[-1].index
+        assert loop.new[0] == slam.map.keyframes[-1].index
         assert len(loop.new) >= 3
         for index, T in zip(loop.new, loop.T, strict=True):
-            old, new = tracker.map.anchor(loop.old)[0], tracker.map.anchor(index)[0]
+            old, new = slam.map.anchor(loop.old)[0], slam.map.anchor(index)[0]
             truth = inverse(TRUTH[frame(new)]) @ TRUTH[frame(old)]
             off = np.linalg.norm((T @ inverse(truth))[:3, 3])
             assert off < 0.02
