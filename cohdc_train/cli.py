@@ -2,10 +2,12 @@
 costs nothing.
 """
 
+import difflib
 import importlib
+import re
 import sys
-from collections.abc import Container, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Container, Mapping, Sequence
+from typing import Any, NamedTuple, NoReturn
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 
@@ -66,6 +68,8 @@ _TRAIN_PACKAGES = frozenset({
 })
 # fmt: on
 
+_MAX_USAGE_OPTIONS = 40  # more are not listed in the usage line
+
 
 def help_text() -> str:
     """What `cohdc --help` prints."""
@@ -100,11 +104,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _call(name: str, args: list[str]) -> None:
     verb = VERBS[name]
     try:
-        component = getattr(importlib.import_module(f"cohdc_train.{verb.module}"), verb.attribute)
+        module = importlib.import_module(f"cohdc_train.{verb.module}")
+        component = getattr(module, verb.attribute)
         if name == "fit":  # Lightning's own command line, which reads the arguments itself
             component(args)
             return
-        _run_function(component, args, f"cohdc {name}")
+        renamed = getattr(module, "RENAMED_OPTIONS", {})
+        _run_function(component, args, f"cohdc {name}", renamed)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
@@ -132,9 +138,33 @@ def _spelled_out(args: Sequence[str], switches: Container[str]) -> list[str]:
     return spelled
 
 
-def _run_function(component: Any, args: list[str], prog: str) -> None:
+def unknown_option(name: str, known: Sequence[str], renamed: Mapping[str, str]) -> str:
+    """Return the message for an option that does not exist, with the one that is probably meant.
+
+    renamed: options of earlier versions and their names of today.
+    """
+    if name in renamed:
+        return f"no option {name}; it is {renamed[name]} now"
+    close = difflib.get_close_matches(name, known, 1, 0.7)
+    return f"no option {name}; did you mean {close[0]}?" if close else f"no option {name}"
+
+
+def _short_usage(prog: str, actions: Sequence[Any]) -> str:
+    """Return the usage of a parser with its required arguments only."""
+    words = []
+    for action in actions:
+        if action.required and action.option_strings:
+            words.append(f"{action.option_strings[0]} {action.dest.upper()}")
+        elif action.required:
+            words.append(action.dest)
+    return " ".join([prog, *words, "[options]"])
+
+
+def _run_function(component: Any, args: list[str], prog: str, renamed: Mapping[str, str]) -> None:
     """Run a typed function, or the group of them in a dict, with a command line read from its
     signature.
+
+    renamed: options of earlier versions and their names of today, for messages.
     """
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
@@ -143,8 +173,8 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
     class Parser(ArgumentParser):
         """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`.
 
-        One inside a group does: `--method.loops false`; jsonargparse copies this method for groups,
-        without its scope.
+        One inside a group does: `--settings.loops.enabled false`; jsonargparse copies this method
+        for groups, without its scope.
         """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
@@ -155,6 +185,18 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
             return super().add_argument(*names, **kwargs)
 
         def parse_args(self, args: Any = None, *rest: Any, **kwargs: Any) -> Any:
+            self.allow_abbrev = False
+            if len(self._option_string_actions) > _MAX_USAGE_OPTIONS:
+                self.usage = _short_usage(self.prog, self._actions)
             return super().parse_args(_spelled_out(args, switches), *rest, **kwargs)
+
+        def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+            unknown = re.match(r"unrecognized arguments: (--[\w.]+)", message)
+            if unknown is None:
+                super().error(message, ex)
+            options = [name for name in self._option_string_actions if name.startswith("--")]
+            text = unknown_option(unknown[1], options, renamed)
+            print(f"{self.prog}: {text}", file=sys.stderr)
+            raise SystemExit(2)
 
     auto_cli(component, args=args, prog=prog, as_positional=True, parser_class=Parser)

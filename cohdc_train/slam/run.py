@@ -34,6 +34,30 @@ from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
 from cohdc_train.trajectory.trajectory import read_tum
 
+# Options of earlier versions: `cohdc slam` tells their names of today.
+RENAMED_OPTIONS = {
+    "--sequence": "the first argument, cohdc slam SEQUENCE,",
+    "--seed": "--settings.seed",
+    "--features": "--settings.features.max_keypoints",
+    "--cloud": "--dense_cloud",
+    "--idle": "--idle_timeout",
+    "--view": "--viewer",
+    "--culling.dynamic_classes": "--settings.masks.dynamic_classes",
+    "--culling.score": "--settings.masks.min_score",
+    "--culling.quality": "--settings.masks.min_quality",
+    "--culling.dilate": "--settings.masks.dilation_px",
+    "--culling.doubt": "--settings.masks.quality_dilation",
+    "--method.loops": "--settings.loops.enabled",
+    "--method.refinement": "--settings.refinement.enabled",
+    "--method.geometry": "--settings.free_space.enabled",
+    "--method.static_weights": "--settings.motion_segmentation.enabled",
+    "--method.global_adjustment": "--settings.bundle_adjustment.global_enabled",
+    "--method.every_frame": "--settings.bundle_adjustment.use_all_frames",
+    "--method.smoothing": "--settings.smoothing.enabled",
+    "--method.keyframe_culling": "--settings.keyframe_culling.enabled",
+    "--method.flow": "--settings.flow.enabled",
+}
+
 
 @dataclass(frozen=True)
 class RunOptions:
