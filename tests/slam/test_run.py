@@ -227,14 +227,14 @@ def test_second_run_replaces_its_files_removes_stale_ones_and_keeps_the_rest(
     [
         (lambda root: (root / "rgb.txt").unlink(), "rgb.txt: cannot be read"),
         (lambda root: (root / "depth.txt").write_text("1.0\n"), "depth.txt:1: expected"),
-        (lambda root: (root / "camera.yaml").unlink(), "cannot tell the camera"),
+        (lambda root: (root / "camera.yaml").unlink(), "does not tell the camera"),
         (
             lambda root: (root / "camera.yaml").write_text("fx: 1\n fy: 2\n"),
-            "camera.yaml:2: broken yaml",
+            "camera.yaml:2: broken YAML",
         ),
         (
             lambda root: (root / "camera.yaml").write_text(CAMERA_YAML.replace("320", "640")),
-            "the camera says 640x240",
+            "but the camera is 640x240",
         ),
         (
             lambda root: next((root / "masks").iterdir()).unlink(),

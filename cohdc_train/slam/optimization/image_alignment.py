@@ -90,18 +90,27 @@ class _Template:
 
 
 def warp_jacobian(points: Array, camera: Camera) -> Array:
-    """dW/dp at p = 0. points: [x, 3] in the camera frame, m. Returns [x, 2, 6] px per (m, rad)."""
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    result = np.zeros((len(points), 2, 6))
-    result[:, 0, 0], result[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
-    result[:, 1, 1], result[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-    result[:, 0, 3:] = np.stack(
-        [-camera.fx * x * y / z**2, camera.fx * (1 + (x / z) ** 2), -camera.fx * y / z], axis=1
-    )
-    result[:, 1, 3:] = np.stack(
-        [-camera.fy * (1 + (y / z) ** 2), camera.fy * x * y / z**2, camera.fy * x / z], axis=1
-    )
-    return result
+    """Compute the derivative of the projection by the camera's motion, at zero (paper eq. 10).
+
+    u = fx x / z + cx, v = fy y / z + cy.
+
+    Args:
+        points: [n, 3] in the camera frame, m.
+        camera: pinhole camera.
+
+    Returns:
+        [n, 2, 6] px per (translation m, rotation rad).
+    """
+    x, y, z = points.T
+    fx, fy = camera.fx, camera.fy
+    zero = np.zeros_like(z)
+    du_dt = np.stack([fx / z, zero, -fx * x / z**2], axis=1)
+    dv_dt = np.stack([zero, fy / z, -fy * y / z**2], axis=1)
+    du_dr = np.stack([-fx * x * y / z**2, fx * (1 + (x / z) ** 2), -fx * y / z], axis=1)
+    dv_dr = np.stack([-fy * (1 + (y / z) ** 2), fy * x * y / z**2, fy * x / z], axis=1)
+    du = np.concatenate([du_dt, du_dr], axis=1)
+    dv = np.concatenate([dv_dt, dv_dr], axis=1)
+    return np.stack([du, dv], axis=1)
 
 
 @dataclass(frozen=True)

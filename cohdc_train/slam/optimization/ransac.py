@@ -9,6 +9,7 @@ from cohdc_train.slam.config import RansacConfig
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.optimization.reprojection import MIN_DEPTH_M, Observations
+from cohdc_train.trajectory.metrics import nearest_rotation
 
 
 def rigid_transforms(source: Array, target: Array) -> Array:
@@ -17,11 +18,8 @@ def rigid_transforms(source: Array, target: Array) -> Array:
     """
     from_mean, to_mean = source.mean(axis=1), target.mean(axis=1)
     covariance = (target - to_mean[:, None]).transpose(0, 2, 1) @ (source - from_mean[:, None])
-    U, _, Vt = np.linalg.svd(covariance)
-    turn = np.ones((len(source), 3))
-    turn[:, 2] = np.sign(np.linalg.det(U @ Vt))
     result = np.zeros((len(source), 4, 4))
-    result[:, :3, :3] = (U * turn[:, None, :]) @ Vt
+    result[:, :3, :3] = nearest_rotation(covariance)
     result[:, :3, 3] = to_mean - np.einsum("hij,hj->hi", result[:, :3, :3], from_mean)
     result[:, 3, 3] = 1.0
     return result

@@ -162,4 +162,4 @@ class RerunViewer:
         points = rerun.Points3D(cloud.points, colors=cloud.colors, radii=_POINT_RADIUS_M)
         log("world/points", points)
         path = point_map.way()[:, :3, 3]
-        log("world/way", rerun.LineStrips3D([path], colors=[_PATH_COLOR]))
+        log("world/trajectory", rerun.LineStrips3D([path], colors=[_PATH_COLOR]))

@@ -89,7 +89,7 @@ def slam() -> Slam:
 
 
 def remember(seen: ObservedFrames, row: int, slam: Slam) -> None:
-    """The tracker's latest frame, as one in that row of the log."""
+    """The slam's latest frame, as one in that row of the log."""
     last = slam.tracker.state.last
     assert last is not None
     seen.add(row, last.matches, True, lambda _: last.features, slam.map)
