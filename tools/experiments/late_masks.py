@@ -65,7 +65,7 @@ class LateMasks:
         return self._carried.mask(view)
 
     def _done(self, job: SegmentationJob) -> None:
-        mask, growth = self._segment(job.view)
+        mask, growth = self._segment(job.frame)
         self._carried.update(job, downsample_mask(mask), growth)
         self._at_work = None
 

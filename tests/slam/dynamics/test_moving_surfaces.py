@@ -220,10 +220,10 @@ def test_object_that_approaches_the_camera_does_not_drag_the_pose() -> None:
     slam, covered = Slam(CAMERA, slam_config(500)), []
     for index, (t, pose) in enumerate(zip(stamps, path, strict=True)):
         rgb, depth, board = render([*room(), approaching_board(index)], pose)
-        track(slam, rgb, depth, float(t))
+        result = track(slam, rgb, depth, float(t))
         if 20 <= index < 90:
-            assert slam.mask is not None
-            covered.append(slam.mask[board].mean())
+            assert result.dynamic_mask is not None
+            covered.append(result.dynamic_mask[board].mean())
     found = slam.trajectory()
     assert len(found) == len(path)
     assert score(Trajectory(stamps, path), found)["ate_m"]["rmse"] < 0.01
@@ -247,5 +247,5 @@ def test_tracking_survives_a_false_mask_while_the_camera_turns(frames: int) -> N
         rgb, depth, _ = render(wall, turned)
         pose = track(slam, rgb, depth, k / 30, most if 20 <= k < 20 + frames else most & False)
         assert pose.is_tracked, k
-    assert slam.mask is not None
-    assert not slam.mask.any()
+    assert pose.dynamic_mask is not None
+    assert not pose.dynamic_mask.any()

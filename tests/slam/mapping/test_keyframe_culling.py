@@ -83,7 +83,7 @@ def test_patches_are_bounded_with_the_points() -> None:
     assert slam.tracker.parts.refiner is not None
     assert slam.map.joined > len(slam.map.keyframes)
     assert len(slam.tracker.parts.refiner._patches) == len(slam.map.positions)
-    assert len(slam.trajectory()[0]) == 2 * ROUND
+    assert len(slam.trajectory()) == 2 * ROUND
 
 
 @pytest.mark.slow
