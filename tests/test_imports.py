@@ -247,6 +247,7 @@ SLAM_ROOMS = [
     "io",
     "dynamics",
     "tracking",
+    "system",
     "visualization",
     "runtime",
     "runner",
@@ -257,7 +258,7 @@ SLAM_APART = {
     "frame": {"optimization", "mapping", "loop_closing"},
     "io": {"features", "optimization", "mapping", "loop_closing"},
     "dynamics": {"loop_closing"},
-    "tracking": {"io"},
+    "tracking": {"io", "loop_closing"},
     "runtime": {"visualization"},
 }
 
