@@ -259,7 +259,8 @@ SLAM_APART = {
     "io": {"features", "optimization", "mapping", "loop_closing"},
     "dynamics": {"loop_closing"},
     "tracking": {"io", "loop_closing"},
-    "runtime": {"visualization"},
+    "visualization": {"loop_closing", "tracking", "system"},
+    "runtime": {"loop_closing", "tracking", "system", "visualization"},
 }
 
 

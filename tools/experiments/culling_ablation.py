@@ -3,7 +3,7 @@
 filter at 0.9.
 
     tools/experiments/culling_ablation.py --sequences DIR [DIR ...] --out OUT [--model person]
-        [--seeds 0 1 2] [--method KEY=VALUE ...]
+        [--seeds 0 1 2] [--settings OPTION=VALUE ...]
 
 The model segments every frame once; the masks that each way of culling makes of that are written as
 PNGs, and `cohdc slam` runs on them. The bands that are alike are as wide as those by quality are on
@@ -21,17 +21,17 @@ from typing import Any
 
 import cv2
 import numpy as np
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
 from cohdc_train.files import write_json, write_text
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Detections, Segmenter
-from cohdc_train.slam.config import Culling, MaskConfig
+from cohdc_train.slam.config import MaskConfig, SlamConfig
 from cohdc_train.slam.dynamics.mask_sources import dilation_for, dynamic_mask, select_dynamic
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
 from cohdc_train.slam.io.tum import read_mask
-from cohdc_train.slam.run import slam
+from cohdc_train.slam.run import run_slam
 
 Row = dict[str, Any]
 BY_QUALITY = MaskConfig(quality_dilation=1.0)
@@ -53,12 +53,13 @@ def main() -> None:
             row = {"sequence": sequence.name, "way": way}
             row |= write_masks(folder / "masks", found, truth, labels, config)
             for seed in arguments.seeds:
-                given = {
-                    "masks": folder / "masks",
-                    "culling": Culling(dilate=0),
-                    "method": arguments.method,
-                }
-                metrics = slam(sequence=sequence, out=folder / f"seed{seed}", seed=seed, **given)
+                options = {"seed": seed, "masks.dilation_px": 0, **arguments.settings}
+                metrics = run_slam(
+                    sequence,
+                    folder / f"seed{seed}",
+                    masks=folder / "masks",
+                    settings=SlamConfig().override(options),
+                )
                 ate = metrics.get("ate_m", {}).get("rmse")
                 rows.append(row | {"seed": seed, "ate_m": ate, "coverage": metrics["coverage"]})
                 write_json(arguments.out / "culling.json", rows)
@@ -67,7 +68,7 @@ def main() -> None:
 
 
 def parse() -> argparse.Namespace:
-    """The arguments; `method` is a Method."""
+    """Return the arguments."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -79,7 +80,7 @@ def parse() -> argparse.Namespace:
         "--model", type=Path, default=Path("person"), help="ONNX or a shipped network's name"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    add_method_option(parser)
+    add_settings_option(parser)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     return arguments

@@ -7,7 +7,7 @@ between matched frames.
 
 Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done at once, no frame
 is dropped, and the segmenter always takes --late frames: the same numbers on every machine.
-`--method flow=false` matches every frame, as synchronous runs do. A few corners more or fewer show
+`--settings flow.enabled=false` matches every frame, as synchronous runs do. A few corners more or fewer show
 what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the means. Without
 --model masks are those in the sequence's folder `masks`.
 """
@@ -17,12 +17,12 @@ import statistics
 from collections.abc import Callable
 from pathlib import Path
 
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.slam.config import MaskConfig, Method
+from cohdc_train.slam.config import MaskConfig, SlamConfig
 from cohdc_train.slam.dynamics.mask_propagation import (
     PropagatedMask,
     SegmentationJob,
@@ -30,15 +30,15 @@ from cohdc_train.slam.dynamics.mask_propagation import (
 )
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
 from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
 from cohdc_train.slam.runtime.async_masks import SegmentFunction
 from cohdc_train.slam.runtime.executors import SynchronousExecutor
 from cohdc_train.slam.runtime.threads import single_threaded
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import read_tum
 
 
 class LateMasks:
@@ -51,7 +51,7 @@ class LateMasks:
         self._carried = PropagatedMask()
         self._at_work: SegmentationJob | None = None
 
-    def __call__(self, view: View) -> Mask:
+    def __call__(self, view: RGBDFrame) -> Mask:
         """[H, W] bool, True = dynamic."""
         if self._late == 0:
             return dilate_mask(*self._segment(view))
@@ -65,7 +65,7 @@ class LateMasks:
         return self._carried.mask(view)
 
     def _done(self, job: SegmentationJob) -> None:
-        mask, growth = self._segment(job.view)
+        mask, growth = self._segment(job.frame)
         self._carried.update(job, downsample_mask(mask), growth)
         self._at_work = None
 
@@ -74,7 +74,7 @@ def remembered(segment: SegmentFunction) -> SegmentFunction:
     """The same, asked once for every frame."""
     known: dict[str, tuple[Mask, float]] = {}
 
-    def ask(view: View) -> tuple[Mask, float]:
+    def ask(view: RGBDFrame) -> tuple[Mask, float]:
         if view.name not in known:
             known[view.name] = segment(view)
         return known[view.name]
@@ -94,19 +94,23 @@ def opened(folder: Path, model: Path | None) -> tuple[RecordedSequence, SegmentF
 
 
 def error(
-    source: RecordedSequence, masks: Callable[[View], Mask], features: int, method: Method
+    source: RecordedSequence, masks: Callable[[RGBDFrame], Mask], settings: SlamConfig
 ) -> float:
-    """ATE RMSE, m."""
+    """Return the ATE RMSE, m."""
     with single_threaded():
-        tracker = Tracker(source.camera, features, 0, method, SynchronousExecutor())
-        for view in source:
-            tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
-        tracker.finish()
+        slam = Slam(source.camera, settings, executor=SynchronousExecutor())
+        for frame in source:
+            slam.track(frame, masks(frame))
+        trajectory = slam.finish()
     assert source.groundtruth is not None
-    rmse: float = score(read_tum(source.groundtruth), Trajectory(*tracker.trajectory()))["ate_m"][
-        "rmse"
-    ]
+    rmse: float = score(read_tum(source.groundtruth), trajectory)["ate_m"]["rmse"]
     return rmse
+
+
+def settings_of(arguments: argparse.Namespace, max_keypoints: int) -> SlamConfig:
+    """Return the settings of a run."""
+    options = {"features.max_keypoints": max_keypoints, **arguments.settings}
+    return SlamConfig().override(options)
 
 
 def main() -> None:
@@ -121,7 +125,7 @@ def main() -> None:
     parser.add_argument(
         "--features", type=int, nargs="+", default=[1475, 1500, 1525], help="corners a frame"
     )
-    add_method_option(parser)
+    add_settings_option(parser)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     try:
@@ -140,7 +144,7 @@ def run(arguments: argparse.Namespace) -> None:
         source, segment = opened(folder, arguments.model)
         for late in arguments.late:
             errors = [
-                error(source, LateMasks(segment, late), n, arguments.method)
+                error(source, LateMasks(segment, late), settings_of(arguments, n))
                 for n in arguments.features
             ]
             rows += [

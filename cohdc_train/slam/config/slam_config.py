@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cohdc_train.errors import DataError
 from cohdc_train.slam.config.checks import Check
 from cohdc_train.slam.config.dynamics import (
     FreeSpaceConfig,
@@ -88,6 +89,10 @@ class SlamConfig:
 
     def __post_init__(self) -> None:
         Check("settings", self).at_least(0, "seed")
+        needed, given = self.tracking.min_points_to_initialize, self.features.max_keypoints
+        if given < needed:
+            limit = f"tracking.min_points_to_initialize, {needed}, or more"
+            raise DataError(f"features.max_keypoints is {given}; allowed: {limit}")
 
     @classmethod
     def from_yaml(cls, path: Path) -> "SlamConfig":

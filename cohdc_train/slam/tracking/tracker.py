@@ -272,10 +272,12 @@ class Tracker:
         )
         self.parts.motion.correct(inverse(estimate.T_cw) @ keyframe.T_cw)
         keypoints = np.flatnonzero(keyframe.point_ids >= 0)
+        is_first = estimate.reference is None
         return replace(
             estimate,
             T_cw=keyframe.T_cw,
             matches=Matches(keyframe.point_ids[keypoints], keypoints),
+            num_inliers=len(keypoints) if is_first else estimate.num_inliers,
             frame_features=replace(estimate.frame_features, features=keyframe.features),
             reference=keyframe,
             prior=None,

@@ -8,21 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from plane_world import CAMERA, camera_path, passer_by, render, room
+from plane_world import CAMERA, camera_path, passer_by, render, room, slam_config, track
 
-from cohdc_train.slam.config import Method
+from cohdc_train.slam.config import FeatureConfig
 from cohdc_train.slam.dynamics.dynamic_mask import DynamicMaskEstimator
 from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker, ReferenceDepth
 from cohdc_train.slam.features.orb import OrbExtractor
-from cohdc_train.slam.frame import FrameRecord, View
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, exp_se3
 from cohdc_train.slam.io.live import LiveCamera
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
-from cohdc_train.slam.runner import play
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.runner import track_sequence
+from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
 
@@ -119,7 +119,9 @@ def test_mask_is_released_after_a_rest_and_moving_objects_are_added() -> None:
 
 
 def keyframe(index: int, t: float, nearest: Depth) -> Keyframe:
-    nothing = OrbExtractor(CAMERA, 10)(np.zeros((240, 320, 3), np.uint8), wall())
+    nothing = OrbExtractor(CAMERA, FeatureConfig(max_keypoints=10))(
+        np.zeros((240, 320, 3), np.uint8), wall()
+    )
     return Keyframe(
         index,
         t,
@@ -135,20 +137,19 @@ def test_person_at_rest_is_used_for_tracking_but_masked_for_observers(tmp_path: 
     """A board stays static under its mask for 3 s."""
     views = [render([*room(), passer_by(20)], T_wc) for T_wc in camera_path(16)]
     frames = [(rgb, depth, index / 5) for index, (rgb, depth, _) in enumerate(views)]
-    tracker, seen = Tracker(CAMERA, features=500), []
+    slam, seen = Slam(CAMERA, slam_config(500)), []
 
-    def observer(
-        view: View, mask: NDArray[np.bool_] | None, record: FrameRecord, tracker: Tracker
-    ) -> None:
+    def observer(frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
+        mask = result.union_mask
         assert mask is not None
-        assert tracker.mask is not None
-        board = views[round(5 * view.t)][2]
-        seen.append((mask[board].mean(), tracker.mask[board].mean()))
+        assert result.dynamic_mask is not None
+        board = views[round(5 * frame.timestamp)][2]
+        seen.append((mask[board].mean(), result.dynamic_mask[board].mean()))
 
-    play(
-        tracker,
+    track_sequence(
+        slam,
         LiveCamera(CAMERA, frames),
-        lambda view: views[round(5 * view.t)][2],
+        lambda frame: views[round(5 * frame.timestamp)][2],
         tmp_path / "pictures",
         [observer],
     )
@@ -190,9 +191,9 @@ def test_moving_point_loses_weight_and_regains_it_at_rest() -> None:
 
 def test_merged_duplicate_keeps_its_motion_odds() -> None:
     """Two keypoints of a moving object became two points, of which one was found moving."""
-    tracker = Tracker(CAMERA, features=200)
-    tracker.track(*render(room(), STILL)[:2], 0.0)
-    world = tracker.map
+    slam = Slam(CAMERA, slam_config(200))
+    track(slam, *render(room(), STILL)[:2], 0.0)
+    world = slam.map
     for moving in ([7, 12], [12]):
         world.update_static_odds(still=np.zeros(0, dtype=np.int64), moving=np.array(moving))
     caught = world.trust(np.array([7, 12]))
@@ -206,7 +207,7 @@ def test_delayed_depth_is_moved_to_the_time_of_the_color_image() -> None:
     lag = np.linalg.inv(exp_se3(np.array([0.01, 0.0, 0.03, 0.0, 0.02, 0.0])))
     rgb, depth, _ = render(room()[:1], STILL)
     late = render(room()[:1], np.linalg.inv(lag))[1]
-    extract = OrbExtractor(CAMERA, 300)
+    extract = OrbExtractor(CAMERA, FeatureConfig(max_keypoints=300))
     truth, told, untold = (
         extract(rgb, *rest).depths for rest in ((depth,), (late, None, lag), (late,))
     )
@@ -219,11 +220,10 @@ def test_motion_segmentation_reduces_the_error_by_a_passer_by() -> None:
     path = camera_path(frames)
     views = [render([*room(), passer_by(k)], path[k])[:2] for k in range(frames)]
     errors = []
-    for method in (Method(geometry=False, static_weights=False), Method()):
-        tracker = Tracker(CAMERA, features=500, method=method)
+    without = {"free_space__enabled": False, "motion_segmentation__enabled": False}
+    for options in (without, {}):
+        slam = Slam(CAMERA, slam_config(500, **options))
         for t, (rgb, depth) in zip(stamps, views, strict=True):
-            tracker.track(rgb, depth, float(t))
-        errors.append(
-            score(Trajectory(stamps, path), Trajectory(*tracker.trajectory()))["ate_m"]["rmse"]
-        )
+            track(slam, rgb, depth, float(t))
+        errors.append(score(Trajectory(stamps, path), slam.trajectory())["ate_m"]["rmse"])
     assert errors[1] < 0.2 * errors[0]

@@ -14,7 +14,7 @@ from cohdc_train.slam.dynamics.mask_propagation import (
     downsample_mask,
     snap_to_depth,
 )
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 
 HEIGHT, WIDTH = 240, 320
 WALL, PERSON = 3.0, 1.5  # m
@@ -144,9 +144,9 @@ def test_depth_decides_only_near_the_mask_edge() -> None:
 
 def test_mask_before_the_first_update_is_empty() -> None:
     rgb, depth = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.float32)
-    view = View(0.0, "0", "0", rgb, depth)
+    frame = RGBDFrame(0.0, rgb, depth)
     propagated = PropagatedMask()
-    propagated.advance(view)
-    mask = propagated.mask(view)
+    propagated.advance(frame)
+    mask = propagated.mask(frame)
     assert mask.shape == (HEIGHT, WIDTH)
     assert not mask.any()

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 from plane_world import CAMERA, render, room
 
+from cohdc_train.slam.config import FeatureConfig, MatchingConfig
 from cohdc_train.slam.features.depth_sampling import sample_depth
 from cohdc_train.slam.features.descriptors import hamming
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import match_descriptors
-from cohdc_train.slam.features.orb import OrbExtractor, spread
+from cohdc_train.slam.features.orb import OrbExtractor, select_on_grid
 
 
 def test_the_mask_costs_no_budget() -> None:
     rgb, depth, _ = render(room(), np.eye(4))
     mask = np.zeros((240, 320), dtype=np.bool_)
     mask[:, :150] = True
-    extract = OrbExtractor(CAMERA, budget=300)
+    extract = OrbExtractor(CAMERA, FeatureConfig(max_keypoints=300))
     features, unmasked = extract(rgb, depth, mask), extract(rgb, depth)
     columns, rows = np.rint(features.pixels).astype(int).T
     assert not mask[rows, columns].any()
@@ -36,7 +37,7 @@ def test_corners_spread_over_cells_and_levels() -> None:
     )
     higher = np.array([[10.0, 10.0, 1.0, 7.0], [12.0, 10.0, 1.0, 9.0]])
     table = np.concatenate([strong, weak, higher])
-    chosen = spread(table, quota=np.array([20, 1]))
+    chosen = select_on_grid(table, np.array([20, 1]), np.array([32.0, 38.4]))
     assert set(range(300, 308)) <= set(chosen.tolist()), (
         "one weak corner of every cell goes before a crowd's second"
     )
@@ -51,7 +52,10 @@ def test_no_earlier_frame_decides_which_corners_are_chosen() -> None:
     squares = np.kron(tiles, np.ones((16, 16)))  # corners of two grey levels: responses are alike
     rgb = np.repeat((80 + 90 * squares)[..., None], 3, axis=2).astype(np.uint8)
     depth = np.full((240, 320), 2.0, dtype=np.float32)
-    fresh, used = OrbExtractor(CAMERA, 100), OrbExtractor(CAMERA, 100)
+    fresh, used = (
+        OrbExtractor(CAMERA, FeatureConfig(max_keypoints=100)),
+        OrbExtractor(CAMERA, FeatureConfig(max_keypoints=100)),
+    )
     used(
         np.full_like(rgb, 90), depth
     )  # a picture without corners: the next one is sought with the lowest threshold
@@ -67,7 +71,7 @@ def test_depth_is_refused_beside_edges_and_masks() -> None:
     mask = np.zeros((240, 320), dtype=np.bool_)
     mask[:, 200:] = True
     pixels = np.array([[20.0, 20], [99, 20], [101, 20], [50, 50], [150, 20], [199, 20], [319, 239]])
-    got = sample_depth(depth, pixels, mask)
+    got = sample_depth(depth, pixels, FeatureConfig(), mask)
     np.testing.assert_array_equal(np.isnan(got), [False, True, True, True, False, True, True])
     np.testing.assert_allclose(got[[0, 4]], [2.0, 3.0])
 
@@ -106,7 +110,7 @@ def test_mutually_nearest_descriptors_are_those_of_a_search_through_all() -> Non
         np.zeros(n),
         np.zeros(n, bool),
     )
-    matches = match_descriptors(np.arange(100, 140), there, features)
+    matches = match_descriptors(np.arange(100, 140), there, features, MatchingConfig())
     bits = hamming(there[:, None], here)
     nearest = (bits == bits.min(axis=0)) & (bits == bits.min(axis=1, keepdims=True)) & (bits <= 60)
     pairs = {(100 + i, j) for i, j in np.argwhere(nearest).tolist()}

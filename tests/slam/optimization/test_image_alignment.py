@@ -8,6 +8,7 @@ from loop_world import poor_view, way_round
 from numpy.typing import NDArray
 from plane_world import CAMERA, Rectangle, camera_path, render, room, texture
 
+from cohdc_train.slam.config import FeatureConfig, LoopVerificationConfig
 from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
@@ -16,6 +17,7 @@ from cohdc_train.slam.optimization.image_alignment import align, warp_jacobian
 
 Array = NDArray[np.float64]
 PATH = camera_path(20)
+CONFIG = LoopVerificationConfig()
 
 
 def picture(
@@ -46,7 +48,7 @@ def test_a_small_motion_is_recovered(seed: int) -> None:
         [0.03, 0.015], 3
     )  # 3 cm, 0.9 degrees per axis
     truth = inverse(PATH[19]) @ PATH[0]
-    found = align(picture(PATH[0]), picture(PATH[19], gain=0.8), exp_se3(off) @ truth)
+    found = align(picture(PATH[0]), picture(PATH[19], gain=0.8), exp_se3(off) @ truth, CONFIG)
     assert found is not None
     rest = found.T @ inverse(truth)
     assert np.linalg.norm(rest[:3, 3]) < 0.003
@@ -75,7 +77,7 @@ def test_the_same_poster_before_another_wall_does_not_correlate() -> None:
         for _ in range(2)
     ]
     views = [picture(np.eye(4), [poster, wall]) for wall in walls]
-    same, other = align(views[0], views[0], np.eye(4)), align(views[0], views[1], np.eye(4))
+    same, other = (align(views[0], views[k], np.eye(4), CONFIG) for k in (0, 1))
     assert same is not None
     assert other is not None
     assert same.correlation > 0.99
@@ -84,7 +86,7 @@ def test_the_same_poster_before_another_wall_does_not_correlate() -> None:
 
 def test_pictures_that_see_nothing_in_common_are_refused() -> None:
     away = exp_se3(np.array([0.0, 0, 0, 0, np.pi / 2, 0]))
-    assert align(picture(PATH[0]), picture(PATH[0]), away) is None
+    assert align(picture(PATH[0]), picture(PATH[0]), away, CONFIG) is None
 
 
 def test_what_moves_is_not_in_a_picture() -> None:
@@ -120,7 +122,7 @@ def test_a_picture_keeps_the_geometry(size: tuple[int, int]) -> None:
 
 
 def test_a_place_is_recognised_among_others() -> None:
-    rng, extract = np.random.default_rng(0), OrbExtractor(CAMERA, 300)
+    rng, extract = np.random.default_rng(0), OrbExtractor(CAMERA, FeatureConfig(max_keypoints=300))
     poses = way_round(24, turns=0.95)
     places = PlaceRecognizer()
     for number, pose in enumerate(poses):

@@ -8,10 +8,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from plane_world import write_sequence
+from plane_world import slam_config, write_sequence
 from tool_loader import load_tool
 
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.run import slam
 
 
@@ -38,7 +38,7 @@ def test_a_mask_is_of_the_latest_frame_that_is_done(
     rgb, depth = gray.repeat(3, axis=2), np.full((240, 640), 2.0, dtype=np.float32)
     masks = tool.LateMasks(lambda view: (square(int(view.name)), 0.0), late)
     for frame, wanted in enumerate(made_of):
-        mask = masks(View(frame / 30, str(frame), str(frame), rgb, depth))
+        mask = masks(RGBDFrame(frame / 30, rgb, depth, name=str(frame)))
         assert np.flatnonzero(mask[120, 40::60][:8]).tolist() == [wanted], frame
 
 
@@ -57,14 +57,14 @@ def test_without_flow_and_in_time_it_is_the_synchronous_run(
         "0",
         "2",
     ]
-    monkeypatch.setattr(sys, "argv", ["late_masks", *words, "--method", "flow=false"])
+    monkeypatch.setattr(sys, "argv", ["late_masks", *words, "--settings", "flow.enabled=false"])
     tool.main()
     rows = json.loads((tmp_path / "out" / "late_masks.json").read_text())
     assert [(row["sequence"], row["late"], row["features"]) for row in rows] == [
         ("plane", 0, 400),
         ("plane", 2, 400),
     ]
-    run = slam(sequence=sequence, out=tmp_path / "run", masks=sequence / "masks", features=400)
+    run = slam(sequence, out=tmp_path / "run", masks=sequence / "masks", settings=slam_config(400))
     assert rows[0]["ate_m"] == pytest.approx(run["ate_m"]["rmse"], rel=1e-3)
     assert (
         f"| plane | 0 | {rows[0]['ate_m']:.4f} |"
