@@ -11,7 +11,7 @@ import pytest
 from tool_loader import load_tool
 
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.tum import Frame
+from cohdc_train.slam.io.tum import TimestampedImage
 
 pytest.importorskip("torch", reason="the tool reads people from COCO folders with the train extra")
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120, 5000.0)
@@ -68,7 +68,8 @@ def test_what_is_nearer_hides_a_person_and_the_rest_stays_as_it_was(
     depth[:, :20] = 0
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     cv2.imwrite(str(tmp_path / "c.png"), np.full((120, 160, 3), 120, np.uint8))
-    frame = Frame(0.0, "0", "0", tmp_path / "c.png", tmp_path / "d.png")
+    color, depth_image = tmp_path / "c.png", tmp_path / "d.png"
+    frame = TimestampedImage(0.0, "0", color), TimestampedImage(0.0, "0", depth_image)
     layers = [tool.seen(*standing(tool, 2.0), 0.0, LEVEL, tool.rays(CAMERA, 1))]
     rgb, units, mask = tool.compose(frame, CAMERA, layers, np.random.default_rng(0))
     assert mask[:58].any()

@@ -241,9 +241,9 @@ class FreeSpaceChecker:
         may_move = (depth > 0) & ~comparison.static
         for _ in range(self.config.growth_cells):
             # Depth of the moving cell next to each cell, 0 where there is none.
-            beside = cv2.dilate(np.where(moving, depth, 0.0).astype(np.float32), _CROSS)
-            connected = np.abs(beside - depth) < self.surfaces.depth_jump_m
-            moving |= (beside > 0) & may_move & connected
+            neighbor = cv2.dilate(np.where(moving, depth, 0.0).astype(np.float32), _CROSS)
+            connected = np.abs(neighbor - depth) < self.surfaces.depth_jump_m
+            moving |= (neighbor > 0) & may_move & connected
         return np.asarray(cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_CLOSE, _CROSS) > 0)
 
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import LoopVerificationConfig
 from cohdc_train.slam.geometry.camera import Camera, undistortion_maps
 
-_SIDE = 160  # px of the longer side
 _MASK_KERNEL = np.ones((9, 9))  # dilates a dynamic mask by 4 px
 
 
@@ -41,6 +41,7 @@ def make_depth_image(
     depth: NDArray[np.float32],
     mask: NDArray[np.bool_] | None,
     camera: Camera,
+    side_px: int = LoopVerificationConfig.image_px,
 ) -> DepthImage:
     """Undistort and scale down a frame, without depth on the dynamic mask.
 
@@ -49,8 +50,9 @@ def make_depth_image(
         depth: [H, W] m, 0 = no reading.
         mask: [H, W], True = dynamic.
         camera: that took the frame.
+        side_px: longer side of the small image, px.
     """
-    scale = _SIDE / max(camera.width, camera.height)
+    scale = side_px / max(camera.width, camera.height)
     small = _scale_camera(camera, scale)
     maps = undistortion_maps(camera, small)
 

@@ -56,6 +56,7 @@ class LoopCloser:
 
     Attributes:
         closed: number of loops closed so far.
+        image_px: longer side of the images that `close` takes, px.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class LoopCloser:
     ) -> None:
         """Start without loops. seed: of all random samples."""
         self.closed = 0
+        self.image_px = config.verification.image_px
         self._map = point_map
         self._reprojection = reprojection
         self._config = config.loops

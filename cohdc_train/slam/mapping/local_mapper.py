@@ -32,6 +32,7 @@ class LoopCloserLike(Protocol):
     """Closer of loops among the keyframes of a map."""
 
     closed: int
+    image_px: int
 
     @property
     def loop_keyframes(self) -> set[int]:
@@ -85,13 +86,14 @@ class LocalMapper:
         return not self._tasks
 
     def insert(
-        self, keyframe: Keyframe, patches: Pyramid | None, picture: Callable[[], DepthImage]
+        self, keyframe: Keyframe, patches: Pyramid | None, make_image: Callable[[int], DepthImage]
     ) -> None:
         """Insert a tracked keyframe, and create points at its keypoints with depth.
 
         Then: duplicates fused, bundle adjustment, weak points removed; loops, redundant keyframes
-        removed. patches: image pyramid for the refiner; picture: makes what loop closing keeps.
-        Tasks left of the keyframe before are finished first.
+        removed. patches: image pyramid for the refiner; make_image: makes the image for loop
+        closing, whose longer side it is given in px. Tasks left of the keyframe before are finished
+        first.
         """
         self._run_all_tasks()
         self._world.add_keyframe(keyframe)
@@ -99,7 +101,7 @@ class LocalMapper:
         if self._refiner is not None and patches is not None:
             self._refiner.store(keyframe, patches)
         self._tasks.extend(
-            [lambda: self._settle(keyframe), lambda: self._look_back(keyframe, picture)]
+            [lambda: self._settle(keyframe), lambda: self._look_back(keyframe, make_image)]
         )
         if not self._incremental:
             self._run_all_tasks()
@@ -135,10 +137,10 @@ class LocalMapper:
             self._mapper.start(self._world, keyframe)
         cull(self._world, keyframe.index)
 
-    def _look_back(self, keyframe: Keyframe, picture: Callable[[], DepthImage]) -> None:
+    def _look_back(self, keyframe: Keyframe, make_image: Callable[[int], DepthImage]) -> None:
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
         if self._loops is not None:
-            self._loops.close(keyframe, picture())
+            self._loops.close(keyframe, make_image(self._loops.image_px))
             in_use = in_use | self._loops.loop_keyframes
         culling = self._config.keyframe_culling
         if culling.enabled:

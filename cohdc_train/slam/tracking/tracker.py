@@ -268,7 +268,7 @@ class Tracker:
         self.parts.mapper.insert(
             keyframe,
             estimate.frame_features.pyramid,
-            lambda: make_depth_image(frame.rgb, frame.depth, mask, self.camera),
+            lambda side_px: make_depth_image(frame.rgb, frame.depth, mask, self.camera, side_px),
         )
         self.parts.motion.correct(inverse(estimate.T_cw) @ keyframe.T_cw)
         keypoints = np.flatnonzero(keyframe.point_ids >= 0)

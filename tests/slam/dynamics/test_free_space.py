@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from plane_world import CAMERA, camera_path, passer_by, render, room, slam_config, track
 
-from cohdc_train.slam.config import FeatureConfig
+from cohdc_train.slam.config import FeatureConfig, FreeSpaceConfig, SurfaceConfig
 from cohdc_train.slam.dynamics.dynamic_mask import DynamicMaskEstimator
 from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker, ReferenceDepth
 from cohdc_train.slam.features.orb import OrbExtractor
@@ -227,3 +227,28 @@ def test_motion_segmentation_reduces_the_error_by_a_passer_by() -> None:
             track(slam, rgb, depth, float(t))
         errors.append(score(Trajectory(stamps, path), slam.trajectory())["ate_m"]["rmse"])
     assert errors[1] < 0.2 * errors[0]
+
+
+def test_options_of_free_space_set_grid_and_tolerance() -> None:
+    now = with_box(wall(), 120, 1.5)
+    for config, is_found in (
+        (FreeSpaceConfig(cell_px=16), True),
+        (FreeSpaceConfig(cell_px=16, min_violation_m=2.0), False),
+    ):
+        checker = FreeSpaceChecker(CAMERA, config)
+        references = [ReferenceDepth(STILL, checker.min_depth_grid(wall()))] * 3
+        comparison = checker.compare(now, STILL, references)
+        assert comparison.depth.shape == (15, 20)
+        assert checker.find_moving(comparison).any() == is_found
+
+
+def test_options_of_surfaces_reach_the_dynamic_mask() -> None:
+    """A surface that must have more cells than the box covers never moves."""
+    now = with_box(wall(), 120, 1.5)
+    masks = []
+    for surfaces in (SurfaceConfig(), SurfaceConfig(min_area=1000)):
+        checker = FreeSpaceChecker(CAMERA, surfaces=surfaces)
+        seen = [keyframe(k, float(k), checker.min_depth_grid(wall())) for k in range(3)]
+        masks.append(DynamicMaskEstimator(checker).estimate(None, now, STILL, seen, 10.0))
+    assert masks[0] is not None
+    assert masks[1] is None

@@ -144,9 +144,9 @@ def test_depth_decides_only_near_the_mask_edge() -> None:
 
 def test_mask_before_the_first_update_is_empty() -> None:
     rgb, depth = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.float32)
-    view = RGBDFrame(0.0, rgb, depth, name="0")
+    frame = RGBDFrame(0.0, rgb, depth)
     propagated = PropagatedMask()
-    propagated.advance(view)
-    mask = propagated.mask(view)
+    propagated.advance(frame)
+    mask = propagated.mask(frame)
     assert mask.shape == (HEIGHT, WIDTH)
     assert not mask.any()

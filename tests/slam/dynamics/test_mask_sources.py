@@ -53,10 +53,10 @@ class TwoClassSegmenter:
 
 
 @pytest.fixture
-def view() -> RGBDFrame:
+def frame() -> RGBDFrame:
     """Return a black frame without depth."""
     rgb, depth = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
-    return RGBDFrame(0.0, rgb, depth, name="0")
+    return RGBDFrame(0.0, rgb, depth)
 
 
 def test_contours_of_low_quality_are_dilated_more_and_never_dropped() -> None:
@@ -121,12 +121,12 @@ def test_dilation_of_one_pixel_is_a_disc() -> None:
     assert dilate_mask(mask, 0.0).sum() == 1
 
 
-def test_segmenter_masks_only_the_dynamic_classes(view: RGBDFrame) -> None:
+def test_segmenter_masks_only_the_dynamic_classes(frame: RGBDFrame) -> None:
     model = TwoClassSegmenter()
     everything = MaskConfig(dilation_px=0)
-    assert SegmenterMasks(model, everything)(view).mean() == 0.5  # type: ignore[arg-type]
+    assert SegmenterMasks(model, everything)(frame).mean() == 0.5  # type: ignore[arg-type]
     chairs = MaskConfig(dynamic_classes=("chair",))
-    assert not SegmenterMasks(model, chairs)(view).any()  # type: ignore[arg-type]
+    assert not SegmenterMasks(model, chairs)(frame).any()  # type: ignore[arg-type]
 
 
 def test_unknown_dynamic_class_is_named_with_those_of_the_model() -> None:
@@ -140,9 +140,9 @@ def test_unknown_dynamic_class_is_named_with_those_of_the_model() -> None:
     [(False, None, 20), (True, None, 10), (True, 1.0, 20), (False, 0.0, 10)],
 )
 def test_masks_that_the_network_cuts_by_quality_get_no_extra_dilation(
-    view: RGBDFrame, cut_by_quality: bool, quality_dilation: float | None, px: int
+    frame: RGBDFrame, cut_by_quality: bool, quality_dilation: float | None, px: int
 ) -> None:
     config = MaskConfig(dilation_px=10, quality_dilation=quality_dilation)
     masks = SegmenterMasks(TwoClassSegmenter(0.0, cut_by_quality), config)  # type: ignore[arg-type]
-    assert masks(view)[120].sum() == 160 + px
-    assert masks.segment(view)[1] == px
+    assert masks(frame)[120].sum() == 160 + px
+    assert masks.segment(frame)[1] == px

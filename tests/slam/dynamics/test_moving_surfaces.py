@@ -216,36 +216,38 @@ def approaching_board(index: int) -> Rectangle:
 
 def test_object_that_approaches_the_camera_does_not_drag_the_pose() -> None:
     """The board fills up to two thirds of the image; while it stands, only its edge moves."""
-    path, stamps = camera_path(110), np.arange(110) / 30
+    path, timestamps = camera_path(110), np.arange(110) / 30
     slam, covered = Slam(CAMERA, slam_config(500)), []
-    for index, (t, pose) in enumerate(zip(stamps, path, strict=True)):
+    for index, (timestamp, pose) in enumerate(zip(timestamps, path, strict=True)):
         rgb, depth, board = render([*room(), approaching_board(index)], pose)
-        result = track(slam, rgb, depth, float(t))
+        result = track(slam, rgb, depth, float(timestamp))
         if 20 <= index < 90:
             assert result.dynamic_mask is not None
             covered.append(result.dynamic_mask[board].mean())
-    found = slam.trajectory()
-    assert len(found) == len(path)
-    assert score(Trajectory(stamps, path), found)["ate_m"]["rmse"] < 0.01
+    estimate = slam.trajectory()
+    assert len(estimate) == len(path)
+    assert score(Trajectory(timestamps, path), estimate)["ate_m"]["rmse"] < 0.01
     assert np.mean(covered) > 0.98
     assert min(covered) > 0.8
 
 
-@pytest.mark.parametrize("frames", [1, 4])
-def test_tracking_survives_a_false_mask_while_the_camera_turns(frames: int) -> None:
+@pytest.mark.parametrize("num_masked_frames", [1, 4])
+def test_tracking_survives_a_false_mask_while_the_camera_turns(num_masked_frames: int) -> None:
     """The wall of a round room is one surface; the camera turns at 45 degrees per second."""
-    rng, keypoints = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 17)
-    places = 2 * np.stack([np.sin(keypoints), -np.ones(17), np.cos(keypoints)], axis=1)
+    rng, angles = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 17)
+    corners = 2 * np.stack([np.sin(angles), -np.ones(17), np.cos(angles)], axis=1)
     wall = [
         Rectangle(a, b - a, np.array([0, 4.0, 0]), texture(rng, 800, 200, 500))
-        for a, b in pairwise(places)
+        for a, b in pairwise(corners)
     ]
-    slam, most = Slam(CAMERA, slam_config(500)), np.zeros((240, 320), dtype=np.bool_)
-    most[:, 40:280] = True
+    slam, nothing = Slam(CAMERA, slam_config(500)), np.zeros((240, 320), dtype=np.bool_)
+    false_mask = nothing.copy()
+    false_mask[:, 40:280] = True
     for k in range(60):
-        turned = exp_se3(np.array([0, 0, 0, 0, np.deg2rad(1.5) * k, 0]))
-        rgb, depth, _ = render(wall, turned)
-        pose = track(slam, rgb, depth, k / 30, most if 20 <= k < 20 + frames else most & False)
-        assert pose.is_tracked, k
-    assert pose.dynamic_mask is not None
-    assert not pose.dynamic_mask.any()
+        T_wc = exp_se3(np.array([0, 0, 0, 0, np.deg2rad(1.5) * k, 0]))
+        rgb, depth, _ = render(wall, T_wc)
+        mask = false_mask if 20 <= k < 20 + num_masked_frames else nothing
+        result = track(slam, rgb, depth, k / 30, mask)
+        assert result.is_tracked, k
+    assert result.dynamic_mask is not None
+    assert not result.dynamic_mask.any()

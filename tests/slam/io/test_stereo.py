@@ -13,7 +13,7 @@ from plane_world import CAMERA, CAMERA_YAML, camera_path, passer_by, render, roo
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
-from cohdc_train.slam.config import DepthConfig
+from cohdc_train.slam.config import DepthConfig, StereoConfig
 from cohdc_train.slam.geometry.calibration import load_camera
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.sources import RecordedSequence
@@ -152,3 +152,10 @@ def test_images_too_far_apart_in_time_are_no_pair(tmp_path: Path) -> None:
         DataError, match=r"pair: no image of left\.txt lies within 0\.005 s of one of right\.txt"
     ):
         RecordedSequence(sequence, PAIR, stereo_format(PAIR))
+
+
+def test_options_of_stereo_depth_reach_matcher_and_lists() -> None:
+    config = StereoConfig(max_time_difference_s=0.5, max_disparity_ratio=0.1, block_px=7)
+    matcher = StereoMatcher(PAIR, config)._matcher
+    assert (matcher.getNumDisparities(), matcher.getBlockSize()) == (32, 7)
+    assert stereo_format(PAIR, config).max_difference_s == 0.5

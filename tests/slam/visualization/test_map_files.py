@@ -208,3 +208,10 @@ def test_ply_file_holds_points_and_colors(tmp_path: Path) -> None:
         .read_bytes()
         .endswith(np.array([1, -2.5, 3], "<f4").tobytes() + bytes([7, 8, 9]))
     )
+
+
+def test_mask_margin_of_the_dense_cloud_is_an_option() -> None:
+    depth, mask = np.full((40, 100), 2.0, np.float32), np.zeros((40, 100), np.bool_)
+    mask[:, :10] = True
+    kept = remove_dynamic_depth(depth, mask, DenseCloudConfig(mask_margin_ratio=0.05))[20] > 0
+    assert np.flatnonzero(kept).tolist() == list(range(15, 100))
