@@ -78,6 +78,8 @@ def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequenc
     assert rows[0]["stamp"] == "100.000000"
     assert rows[0]["keyframe"] == "1"
     assert all(0.2 < float(row["culled_share"]) < 0.6 for row in rows)
+    assert all(0 < int(row["inliers"]) <= int(row["matches"]) for row in rows)
+    assert any(int(row["inliers"]) < int(row["matches"]) for row in rows)
     config = yaml.safe_load((masked / "config.yaml").read_text())
     assert config["sequence"] == str(sequence)
     assert config["settings"]["features"]["max_keypoints"] == 500

@@ -21,7 +21,7 @@ _NAMES = (*_TEXT_FILES, "map.ply", "map.png", "pictures")
 _DENSE_CLOUD = "cloud.ply"
 _MIN_SCORED_FRAMES = 3  # fewer poses fix no rigid alignment
 _COLUMNS = (
-    *("stamp", "tracked", "keyframe", "inliers", "culled_share"),
+    *("stamp", "tracked", "keyframe", "matches", "inliers", "culled_share"),
     *("segment_ms", "track_ms", "map_ms"),
 )
 
@@ -104,6 +104,7 @@ def _row(record: FrameRecord) -> list[object]:
         int(record.is_tracked),
         int(record.is_keyframe),
         record.num_matches,
+        record.num_inliers,
         f"{record.masked_ratio:.4f}",
         *(f"{ms:.2f}" for ms in times),
     ]

@@ -12,6 +12,7 @@ from cohdc_train.slam.features.matching import Matches, Projected, match_project
 from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameResult
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
+from cohdc_train.slam.optimization.reprojection import ReprojectionModel, chi_square
 from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
@@ -48,6 +49,19 @@ def test_every_frame_of_a_still_room_is_tracked_to_millimetres(views: list[View]
     assert 2 <= len(slam.map.keyframes) < 25
     assert ate(slam, camera_path(40)) < 0.004
     np.testing.assert_array_equal(poses[0].T_wc, np.eye(4))
+
+
+def test_inliers_are_counted_beside_matches(views: list[View]) -> None:
+    """Matches keep outliers of the chi-square test; inliers are those that agree with the pose."""
+    slam, poses = run(views)
+    others = [pose for pose in poses if not pose.is_keyframe]
+    assert all(0 < pose.num_inliers <= pose.num_matches for pose in others)
+    assert any(pose.num_inliers < pose.num_matches for pose in others)
+    last, extracted = slam.tracker.state.last, others[-1]
+    assert last is not None
+    points, seen = slam.map.measured(last.matches, last.features)
+    chi2 = chi_square(last.T_cw, points, seen, ReprojectionModel(CAMERA))
+    assert extracted.num_inliers == np.count_nonzero(chi2 <= seen.limits)
 
 
 def test_same_seed_same_bits(views: list[View]) -> None:
