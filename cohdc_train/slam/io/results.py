@@ -31,8 +31,9 @@ def compute_metrics(
 ) -> dict[str, Any]:
     """Compute the numbers of metrics.json.
 
-    `coverage` is tracked over associated frames. `ms` has p50 and p95 of each stage, `map` of
-    keyframes only, `depth` of stereo pairs only. `fps` is frames over the time of all stages.
+    `coverage` is tracked over associated frames. `ms` has p50 and p95 of each stage: `map` is of
+    one keyframe, with the work for it on later frames, `depth` of stereo pairs only, `segment` is
+    each frame's wait for its mask. `fps` is frames over the time of all stages.
 
     Args:
         records: of the frames that reached the tracker.
@@ -68,7 +69,17 @@ def _stage_times(records: list[FrameRecord]) -> dict[str, list[float]]:
     times = {"depth": depth} if any(depth) else {}
     times["segment"] = [timing.mask_ms for timing in timings]
     times["track"] = [timing.tracking_ms for timing in timings]
-    times["map"] = [record.timing.mapping_ms for record in records if record.is_keyframe]
+    times["map"] = _mapping_times(records)
+    return times
+
+
+def _mapping_times(records: list[FrameRecord]) -> list[float]:
+    """Return the time of mapping per keyframe, ms, with the work that later frames did for it."""
+    times: list[float] = []
+    for record in records:
+        if record.is_keyframe or not times:
+            times.append(0.0)
+        times[-1] += record.timing.mapping_ms
     return times
 
 

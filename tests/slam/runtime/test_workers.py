@@ -254,5 +254,9 @@ def test_real_time_run_accounts_for_every_frame(tmp_path: Path) -> None:
     assert metrics["frames"] == 24 == len(rows) + metrics["dropped"]
     assert metrics["tracked"] == sum(row["tracked"] == "1" for row in rows)
     assert metrics["coverage"] == metrics["tracked"] / 24
+    assert set(metrics["ms"]) == {"mask", "track", "map"}, "nobody waits for the segmenter"
+    columns = ("segment_ms", "track_ms", "map_ms")
+    busy_ms = sum(float(row[column]) for row in rows for column in columns)
+    assert metrics["fps"] == pytest.approx(1e3 * len(rows) / busy_ms, rel=0.01)
     for key in ("latency_ms", "mask_age_ms", "segmenter_ms"):
         assert 0 <= metrics[key]["p50"] <= metrics[key]["p95"]
