@@ -197,6 +197,41 @@ def test_a_pose_that_is_rejected_judges_no_point(
     np.testing.assert_array_equal(slam.map.moved, 0)
 
 
+def test_result_of_a_frame_does_not_change_when_the_map_does(views: list[View]) -> None:
+    slam = Slam(CAMERA, slam_config(500))
+    first = track(slam, *views[0][:2], 0.0)
+    assert first.is_keyframe
+    assert first.features is not None
+    before = first.features.is_subpixel.copy()
+    keyframe = slam.map.keyframes[0]
+    keypoints = np.flatnonzero(keyframe.point_ids >= 0)[:50]
+    matches = Matches(keyframe.point_ids[keypoints], keypoints)
+    slam.map.forget(keyframe, keypoints)
+    slam.map.observe(keyframe, matches)
+    assert not keyframe.features.is_subpixel[keypoints].any()
+    np.testing.assert_array_equal(first.features.is_subpixel, before)
+
+
+def test_without_refinement_a_pose_is_rejected_once(
+    views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam = Slam(CAMERA, slam_config(500, refinement__enabled=False))
+    track(slam, *views[0][:2], 0.0)
+    attempts: list[object] = []
+    monkeypatch.setattr(
+        slam.tracker.parts.localizer, "refine_pose", lambda *given: attempts.append(given)
+    )
+    assert track(slam, *views[1][:2], 1 / 30).status == "lost"
+    assert len(attempts) == 1
+
+
+def test_status_tells_whether_there_is_a_map(views: list[View]) -> None:
+    slam = Slam(CAMERA, slam_config(500))
+    frames = [(BLACK, NOTHING), views[0][:2], (BLACK, NOTHING), views[1][:2]]
+    statuses = [track(slam, *frame, index / 30).status for index, frame in enumerate(frames)]
+    assert statuses == ["initializing", "tracking", "lost", "tracking"]
+
+
 def features_at(
     points: list[tuple[float, float]], words: list[int], octaves: list[int]
 ) -> Features:
@@ -254,6 +289,7 @@ def test_matches_are_one_to_one_and_clear() -> None:
         ),
         ({"mask": np.zeros((240, 320), dtype=np.uint8)}, r"mask is uint8 .*, not bool"),
         ({"t": 1.0}, r"frame at 1\.000000 s: not after the frame before it, at 1\.000000 s"),
+        ({"t": float("nan")}, r"frame at nan s: not after the frame before it"),
     ],
 )
 def test_frame_that_does_not_fit_is_refused(changes: dict[str, object], message: str) -> None:
