@@ -19,3 +19,4 @@ def test_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     exec(example, names)
     assert names["result"].is_tracked
     assert len(names["trajectory"]) == 4
+    assert (tmp_path / "trajectory.txt").is_file()

@@ -32,7 +32,7 @@ from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
 from cohdc_train.slam.system import Slam
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 # Options of earlier versions: `cohdc slam` tells their names of today.
 RENAMED_OPTIONS = {
@@ -159,7 +159,7 @@ def run_slam(
     sequence = source if isinstance(source, Path) else None
     if isinstance(source, Path):
         source = _open_folder(source, settings, options)
-    truth = None if source.groundtruth is None else read_tum(source.groundtruth)
+    truth = None if source.groundtruth is None else Trajectory.load_tum(source.groundtruth)
     make_masks = _mask_source(model, masks, source.camera, settings, options.realtime)
     with (
         single_threaded(),

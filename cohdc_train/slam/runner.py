@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import write_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.slam.dynamics.mask_sources import MaskSource
 from cohdc_train.slam.features.keypoints import Features
@@ -18,7 +19,7 @@ from cohdc_train.slam.frame import FrameRecord, FrameResult, PoseCallback, RGBDF
 from cohdc_train.slam.io.sources import FrameSource
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.system import Slam
-from cohdc_train.slam.visualization.overlays import draw_after, draw_before, write_jpeg
+from cohdc_train.slam.visualization.overlays import draw_after, draw_before
 from cohdc_train.trajectory.trajectory import Trajectory
 
 _NUM_FIGURES = 6

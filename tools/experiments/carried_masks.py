@@ -26,9 +26,9 @@ from cohdc_train.slam.dynamics.mask_propagation import (
     downsample_mask,
 )
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import RecordedSequence
+from cohdc_train.types import Mask
 
 
 def halves(folder: Path) -> list[tuple[HalfResFrame, Mask]]:

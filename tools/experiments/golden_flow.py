@@ -74,7 +74,7 @@ def run_system(sequence: Path) -> FlowRun:
             rows.append((int(result.is_keyframe), result.num_matches))
         trajectory = system.finish()
     timestamps = getattr(trajectory, "timestamps", None)
-    timestamps = trajectory.stamps if timestamps is None else timestamps
+    timestamps = trajectory.timestamps if timestamps is None else timestamps
     return FlowRun(poses, rows, timestamps, trajectory.poses)
 
 

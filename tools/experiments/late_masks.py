@@ -29,7 +29,7 @@ from cohdc_train.slam.dynamics.mask_propagation import (
     downsample_mask,
 )
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
-from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
+from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
@@ -38,7 +38,8 @@ from cohdc_train.slam.runtime.executors import SynchronousExecutor
 from cohdc_train.slam.runtime.threads import single_threaded
 from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import Mask
 
 
 class LateMasks:
@@ -103,7 +104,7 @@ def error(
             slam.track(frame, masks(frame))
         trajectory = slam.finish()
     assert source.groundtruth is not None
-    rmse: float = score(read_tum(source.groundtruth), trajectory)["ate_m"]["rmse"]
+    rmse: float = score(Trajectory.load_tum(source.groundtruth), trajectory)["ate_m"]["rmse"]
     return rmse
 
 

@@ -31,7 +31,7 @@ from cohdc_train.presets import model_path
 from cohdc_train.slam.config import SlamConfig
 from cohdc_train.slam.run import run_slam
 from cohdc_train.synth.camera_motion import CameraMotion
-from cohdc_train.synth.scenario import Setting
+from cohdc_train.synth.scenario import SceneConfig
 from cohdc_train.synth.sequence import sequence
 
 Row = dict[str, Any]
@@ -46,19 +46,19 @@ class Kind:
     seed: int
     motion: CameraMotion
     people: int
-    scene: Setting = Setting()  # noqa: RUF009 - frozen
+    scene: SceneConfig = SceneConfig()  # noqa: RUF009 - frozen
     length: int = 1
 
 
 KINDS = {
-    "rolling_cart": Kind(101, "xyz", 0, Setting(cart="alone")),
-    "pushed_cart": Kind(102, "halfsphere", 2, Setting(cart="pushed")),
+    "rolling_cart": Kind(101, "xyz", 0, SceneConfig(cart="alone")),
+    "pushed_cart": Kind(102, "halfsphere", 2, SceneConfig(cart="pushed")),
     "loop": Kind(103, "loop", 2, length=2),
     "crowd": Kind(104, "xyz", 9),
-    "plain_wall": Kind(105, "xyz", 2, Setting(walls="plain")),
-    "filled_view": Kind(106, "xyz", 3, Setting(action="fill_view")),
-    "stop_and_go": Kind(107, "halfsphere", 3, Setting(action="stop_and_go")),
-    "sitting": Kind(108, "halfsphere", 3, Setting(action="sit")),
+    "plain_wall": Kind(105, "xyz", 2, SceneConfig(walls="plain")),
+    "filled_view": Kind(106, "xyz", 3, SceneConfig(action="fill_view")),
+    "stop_and_go": Kind(107, "halfsphere", 3, SceneConfig(action="stop_and_go")),
+    "sitting": Kind(108, "halfsphere", 3, SceneConfig(action="sit")),
     "walking_xyz": Kind(109, "xyz", 3),
     "walking_halfsphere": Kind(110, "halfsphere", 3),
     "walking_static": Kind(111, "static", 3),

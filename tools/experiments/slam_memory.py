@@ -31,7 +31,7 @@ from cohdc_train.slam.io.sources import RecordedSequence
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.run import run_slam
 from cohdc_train.trajectory.association import associate
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 RATE = 30  # frames per second
 
@@ -77,9 +77,8 @@ class ForthAndBack:
         self.groundtruth: Path | None = None
         if recorded.groundtruth is not None:
             self.groundtruth = out / "groundtruth.txt"
-            write_tum(
-                self.groundtruth, self._truth(read_tum(recorded.groundtruth), np.array(stamps))
-            )
+            truth = Trajectory.load_tum(recorded.groundtruth)
+            self._truth(truth, np.array(stamps)).save_tum(self.groundtruth)
 
     def __len__(self) -> int:
         return len(self._order)
@@ -93,7 +92,7 @@ class ForthAndBack:
 
     def _truth(self, truth: Trajectory, stamps: np.ndarray) -> Trajectory:
         """The pose nearest in time to every image, at the times they are played."""
-        row = dict(associate(stamps, truth.stamps, 0.02).tolist())
+        row = dict(associate(stamps, truth.timestamps, 0.02).tolist())
         known = [
             (number / RATE, row[place]) for number, place in enumerate(self._order) if place in row
         ]

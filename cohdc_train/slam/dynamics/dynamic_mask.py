@@ -4,10 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.free_space import DepthComparison, FreeSpaceChecker, ReferenceDepth
-from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
+from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.dynamics.moving_surfaces import MovingSurfaceTracker, SurfaceEvidence
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.types import Mask
 
 
 class DynamicMaskEstimator:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.config import MaskConfig
-from cohdc_train.slam.dynamics.masks import Mask, dilate_mask
+from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.frame import RGBDFrame
+from cohdc_train.types import Mask
 
 Floats = NDArray[np.float32]
 

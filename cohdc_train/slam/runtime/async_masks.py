@@ -17,9 +17,9 @@ from cohdc_train.slam.dynamics.mask_propagation import (
     SegmentationJob,
     downsample_mask,
 )
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
+from cohdc_train.types import Mask
 
 # Frame to mask [H, W], True = dynamic, and the dilation that is due, px.
 SegmentFunction = Callable[[RGBDFrame], tuple[Mask, float]]

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import encode_jpeg
 from cohdc_train.slam.config import DenseCloudConfig
 from cohdc_train.slam.dynamics.masks import dilate_mask
 from cohdc_train.slam.frame import FrameResult, RGBDFrame
@@ -20,7 +21,7 @@ from cohdc_train.slam.visualization.voxel_grid import VoxelGrid
 
 _MIN_Z_M = 0.1  # of a point that is compared with an image
 _DEPTH_UNITS = 50_000.0  # of a stored depth image, up to the largest usable depth; 1.3 of it fit
-_JPEG_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95]
+_JPEG_QUALITY = 95
 _PNG_COMPRESSION = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
@@ -92,7 +93,7 @@ class KeyframeImages:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
         units = np.rint(depth * self._units_per_m).astype(np.uint16)
-        jpeg = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG_QUALITY)[1].tobytes()
+        jpeg = encode_jpeg(rgb, _JPEG_QUALITY)
         png = cv2.imencode(".png", units, _PNG_COMPRESSION)[1].tobytes()
         self._file.write(jpeg + png)
         self._stored.append(_StoredImage(frame.timestamp, len(jpeg), len(png)))

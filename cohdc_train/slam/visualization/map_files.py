@@ -89,5 +89,5 @@ class MapFiles:
     def _fuse(self, images: KeyframeImages, trajectory: Trajectory) -> PointCloud:
         """Return the dense cloud."""
         T_cw = inverse(trajectory.poses)
-        poses = dict(zip(trajectory.stamps.tolist(), T_cw, strict=True))
+        poses = dict(zip(trajectory.timestamps.tolist(), T_cw, strict=True))
         return fuse_depth_images(images, poses, self._camera, self._max_depth_m, self._config)

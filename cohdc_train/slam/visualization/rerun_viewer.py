@@ -5,8 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-import cv2
-
+from cohdc_train.drawing import encode_jpeg
 from cohdc_train.errors import CohdcError, MissingExtraError
 from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
@@ -17,7 +16,7 @@ _FLUSH_TIMEOUT_S = 5.0
 _MEMORY_LIMIT = "25%"  # of the machine's memory, before the viewer forgets the oldest data
 _FRUSTUM_M = 0.15
 _POINT_RADIUS_M = 0.006
-_JPEG_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 80]
+_JPEG_QUALITY = 80
 _MASK_COLOR = (230, 40, 40)  # RGB
 _PATH_COLOR = (250, 160, 40)
 
@@ -135,8 +134,7 @@ class RerunViewer:
         rerun, log, T_wc, mask = self._rerun, self._stream.log, result.T_wc, result.union_mask
         if T_wc is not None:
             log("world/camera", rerun.Transform3D(translation=T_wc[:3, 3], mat3x3=T_wc[:3, :3]))
-        bgr = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
-        jpeg = cv2.imencode(".jpg", bgr, _JPEG_QUALITY)[1].tobytes()
+        jpeg = encode_jpeg(frame.rgb, _JPEG_QUALITY)
         log("world/camera/image", rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if mask is not None:
             log("world/camera/mask", rerun.SegmentationImage(mask.astype("uint8"), opacity=0.5))

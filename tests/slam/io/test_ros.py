@@ -27,7 +27,7 @@ from cohdc_train.slam.io.ros import (
     rgb_from_message,
     to_seconds,
 )
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 8
 
@@ -277,7 +277,7 @@ def test_node_publishes_poses_and_writes_results(
     truth = camera_path(FRAMES)[-1]
     last = sent["pose"][-1].pose.position
     np.testing.assert_allclose([-last.y, -last.z, last.x], truth[:3, 3], atol=0.01)
-    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
+    assert len(Trajectory.load_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
 
 
 def test_newest_frame_replaces_the_waiting_one(

@@ -137,7 +137,7 @@ def test_the_books_are_right_after_many_removals(culled: Slam) -> None:
 
 def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Slam) -> None:
     world, T_cw = whole.map, exp_se3(np.array([0.1, 0.0, 0.1, 0.0, 0.1, 0.0]))
-    stamps, before = whole.trajectory().stamps, whole.trajectory().poses
+    stamps, before = whole.trajectory().timestamps, whole.trajectory().poses
     removed = cull_keyframes(world, world.keyframes[-1], set(), CULLING, WINDOW)
     assert removed
     first_keyframe = np.flatnonzero(
@@ -146,7 +146,7 @@ def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Slam) -> No
     )
     assert len(first_keyframe)
     np.testing.assert_allclose(whole.trajectory().poses, before, atol=1e-9)
-    np.testing.assert_array_equal(whole.trajectory().stamps, stamps)
+    np.testing.assert_array_equal(whole.trajectory().timestamps, stamps)
     maps, places = affine(world, first_keyframe, T_cw), world.positions[first_keyframe].copy()
     step = exp_se3(np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]))
     world.move(

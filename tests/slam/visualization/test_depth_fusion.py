@@ -9,24 +9,29 @@ from ply_reader import read_ply
 
 from cohdc_train.slam.run import slam
 from cohdc_train.trajectory.association import match
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 pytest.importorskip("embreex", reason="the renderer comes with the train extra")
 
 from cohdc_train.synth.renderer import render
-from cohdc_train.synth.sequence import Scene, draw_scene, sequence
+from cohdc_train.synth.scenario import RenderedScene, draw_scene
+from cohdc_train.synth.sequence import sequence
 
 FRAMES, SIZE = 60, (240, 320)
 
 
 def cloud_in_true_world(run: Path, folder: Path) -> NDArray[np.float64]:
     """Return the cloud of a run [n, 3] m in the world of the ground truth, by the first pose."""
-    truth, estimate = match(read_tum(folder / "groundtruth.txt"), read_tum(run / "trajectory.txt"))
+    truth, estimate = match(
+        Trajectory.load_tum(folder / "groundtruth.txt"), Trajectory.load_tum(run / "trajectory.txt")
+    )
     T = truth.poses[0] @ np.linalg.inv(estimate.poses[0])
     return np.asarray(read_ply(run / "cloud.ply")[0] @ T[:3, :3].T + T[:3, 3])
 
 
-def errors_and_people(points: NDArray[np.float64], scene: Scene) -> tuple[NDArray[np.float64], int]:
+def errors_and_people(
+    points: NDArray[np.float64], scene: RenderedScene
+) -> tuple[NDArray[np.float64], int]:
     """Measure the distance of points from the empty room, and count those on people.
 
     Returns [n] m, the smallest difference in depth over the true views; and the number of points
@@ -36,7 +41,7 @@ def errors_and_people(points: NDArray[np.float64], scene: Scene) -> tuple[NDArra
     best, people = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.bool_)
     for frame in range(0, FRAMES, 4):
         room = render(scene.room.mesh, atlas, scene.room.lighting, camera, scene.poses[frame]).depth
-        full = scene.view(frame, atlas)
+        full = scene.render_frame(frame, atlas)
         local = (points - scene.poses[frame][:3, 3]) @ scene.poses[frame][:3, :3]
         ahead = np.flatnonzero(local[:, 2] > 0.1)
         x, y, z = local[ahead].T
