@@ -201,14 +201,13 @@ def _export(out: Path) -> None:
 
 
 def _slam(sequence: Path, out: Path, model: Path | None, seed: int) -> dict[str, Any]:
-    from cohdc_train.slam.config import Culling
-    from cohdc_train.slam.run import slam
+    from cohdc_train.slam.config import SlamConfig
+    from cohdc_train.slam.run import run_slam
 
     # A network trained for minutes misses limbs and doubts people at the border: trust less, cut
     # wider.
-    return slam(
-        sequence=sequence, out=out, model=model, seed=seed, culling=Culling(score=0.2, dilate=20)
-    )
+    options = {"seed": seed, "masks.min_score": 0.2, "masks.dilation_px": 20}
+    return run_slam(sequence, out, model=model, settings=SlamConfig().override(options))
 
 
 def _report(out: Path, scores: dict[str, float], clock: Clock) -> None:

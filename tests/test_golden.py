@@ -116,6 +116,10 @@ def test_options_get_the_names_that_the_checkout_knows() -> None:
     assert checkout.translate(["fit", "--pictures=false"], "--figures F") == [
         *("fit", "--figures=false")
     ]
+    newest = new.replace("--seed", "--settings.seed")
+    command = ["slam", "--sequence", "walk", *command[1:]]
+    translated = ["slam", "walk", *renamed, "--settings.seed", "0"]
+    assert checkout.translate(command, newest) == translated
 
 
 def test_a_class_is_found_where_the_checkout_has_it() -> None:

@@ -249,6 +249,7 @@ SLAM_ROOMS = [
     "io",
     "dynamics",
     "tracking",
+    "system",
     "visualization",
     "runtime",
     "runner",
@@ -259,8 +260,9 @@ SLAM_APART = {
     "frame": {"optimization", "mapping", "loop_closing"},
     "io": {"features", "optimization", "mapping", "loop_closing"},
     "dynamics": {"loop_closing"},
-    "tracking": {"io"},
-    "runtime": {"visualization"},
+    "tracking": {"io", "loop_closing"},
+    "visualization": {"loop_closing", "tracking", "system"},
+    "runtime": {"loop_closing", "tracking", "system", "visualization"},
 }
 
 

@@ -111,15 +111,16 @@ def run_sequence(
     if cache_file.is_file() and json.loads(cache_file.read_text()) == request:
         return dict(json.loads((folder / "metrics.json").read_text()))
 
-    from cohdc_train.slam.run import slam
+    from cohdc_train.slam.config import SlamConfig
+    from cohdc_train.slam.run import run_slam
 
     folder.parent.mkdir(parents=True, exist_ok=True)
-    metrics = slam(
-        sequence=sequence,
-        out=folder,
+    metrics = run_slam(
+        sequence,
+        folder,
         model=model if mode == "model" else None,
         masks=sequence / "masks" if mode == "masks" else None,
-        seed=seed,
+        settings=SlamConfig(seed=seed),
     )
     write_json(cache_file, request)
     return metrics

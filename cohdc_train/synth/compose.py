@@ -26,7 +26,7 @@ from cohdc_train.types import Float32Array, FloatArray, Image, Mask
 
 if TYPE_CHECKING:  # loaded when the command runs, so that help stays cheap
     from cohdc_train.slam.geometry.camera import Camera
-    from cohdc_train.slam.io.tum import Entry
+    from cohdc_train.slam.io.tum import TimestampedImage
 
 MIN_SIDE_PX = 120  # shorter side of a cut-out's box
 _MAX_TRIES = 200  # draws of walking paths
@@ -117,11 +117,13 @@ class Recording:
     """
 
     camera: "Camera"
-    pairs: "list[tuple[Entry, Entry]]"
+    pairs: "list[tuple[TimestampedImage, TimestampedImage]]"
     times: FloatArray
     poses: FloatArray
 
-    def frames(self, step: int = 1) -> "Iterator[tuple[tuple[Entry, Entry], FloatArray, float]]":
+    def frames(
+        self, step: int = 1
+    ) -> "Iterator[tuple[tuple[TimestampedImage, TimestampedImage], FloatArray, float]]":
         """Iterate over (images, T_wc, time) of every step-th frame."""
         for i in range(0, len(self.pairs), step):
             yield self.pairs[i], self.poses[i], float(self.times[i])
@@ -141,11 +143,11 @@ def read_recording(sequence: Path, camera_file: Path | None, num_frames: int | N
     camera, _ = choose_camera(sequence, camera_file)
     pairs = read_pairs(sequence / "rgb.txt", sequence / "depth.txt", 0.02)[0][:num_frames]
     truth = Trajectory.load_tum(sequence / "groundtruth.txt")
-    matches = associate(np.array([color.t for color, _ in pairs]), truth.timestamps)
+    matches = associate(np.array([color.timestamp for color, _ in pairs]), truth.timestamps)
     if not len(matches):
         raise DataError(f"{sequence}: no frame within 0.02 s of a pose of groundtruth.txt")
     pairs = [pairs[i] for i in matches[:, 0]]
-    times = np.array([color.t for color, _ in pairs]) - pairs[0][0].t
+    times = np.array([color.timestamp for color, _ in pairs]) - pairs[0][0].timestamp
     return Recording(camera, pairs, times, truth.poses[matches[:, 1]])
 
 
@@ -198,7 +200,7 @@ def draw_paths(
 
     views = []
     for (_, depth), pose, time in recording.frames(max(1, len(recording.pairs) // 40)):
-        background = fill_depth(read_depth(depth.image, recording.camera))
+        background = fill_depth(read_depth(depth.path, recording.camera))
         views.append((time, pose, background[::_RAY_STEP_PX, ::_RAY_STEP_PX]))
     rays = pixel_rays(recording.camera, _RAY_STEP_PX)
     for _ in range(_MAX_TRIES):
@@ -249,24 +251,26 @@ def covered_share(
 
 def _write_frame(
     folder: Path,
-    pair: "tuple[Entry, Entry]",
+    pair: "tuple[TimestampedImage, TimestampedImage]",
     rgb: Image,
     depth: NDArray[np.uint16],
     mask: Mask,
 ) -> None:
     color, depth_image = pair
     images: dict[str, NDArray[Any]] = {
-        f"rgb/{color.stamp}.png": rgb[..., ::-1],
-        f"depth/{depth_image.stamp}.png": depth,
-        f"masks/{color.stamp}.png": mask.astype(np.uint8) * 255,
+        f"rgb/{color.timestamp_text}.png": rgb[..., ::-1],
+        f"depth/{depth_image.timestamp_text}.png": depth,
+        f"masks/{color.timestamp_text}.png": mask.astype(np.uint8) * 255,
     }
     for name, image in images.items():
         if not cv2.imwrite(str(folder / name), image):
             raise DataError(f"{folder / name}: cannot be written")
 
 
-def _write_lists(folder: Path, pairs: "Sequence[tuple[Entry, Entry]]") -> None:
+def _write_lists(
+    folder: Path, pairs: "Sequence[tuple[TimestampedImage, TimestampedImage]]"
+) -> None:
     for kind, index in (("rgb", 0), ("depth", 1)):
-        stamps = [pair[index].stamp for pair in pairs]
+        stamps = [pair[index].timestamp_text for pair in pairs]
         lines = [f"{stamp} {kind}/{stamp}.png\n" for stamp in stamps]
         write_text(folder / f"{kind}.txt", "".join(lines))

@@ -13,7 +13,7 @@ from cohdc_train.types import Float32Array, FloatArray, Image, Mask
 
 if TYPE_CHECKING:  # loaded when the command runs, so that help stays cheap
     from cohdc_train.slam.geometry.camera import Camera
-    from cohdc_train.slam.io.tum import Entry
+    from cohdc_train.slam.io.tum import TimestampedImage
 
 BODY_WIDTH_M, MAX_HEIGHT_M = 0.6, 1.8  # shoulders with arms, and the tallest person
 HEAD_HEIGHT_M = 1.75  # top of the head above the floor
@@ -127,7 +127,7 @@ def fill_depth(depth: Float32Array) -> Float32Array:
 
 
 def compose_frame(
-    pair: "tuple[Entry, Entry]",
+    pair: "tuple[TimestampedImage, TimestampedImage]",
     camera: "Camera",
     layers: Sequence[tuple[Float32Array, FloatArray]],
     rng: np.random.Generator,
@@ -146,8 +146,8 @@ def compose_frame(
     from cohdc_train.slam.io.tum import read_depth, read_rgb
 
     color, depth_image = pair
-    rgb = read_rgb(color.image, camera).astype(np.float32)
-    depth = read_depth(depth_image.image, camera)
+    rgb = read_rgb(color.path, camera).astype(np.float32)
+    depth = read_depth(depth_image.path, camera)
     nearest: NDArray[np.floating] = fill_depth(depth)
     mask = np.zeros(depth.shape, np.bool_)
     brightness = rgb.mean()

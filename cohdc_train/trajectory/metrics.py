@@ -23,13 +23,25 @@ def align_umeyama(source: FloatArray, target: FloatArray) -> FloatArray:
         T [4, 4] with target ~ T @ source.
     """
     mean_source, mean_target = source.mean(0), target.mean(0)
-    U, _, Vt = np.linalg.svd((target - mean_target).T @ (source - mean_source))
-    handedness = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    S = np.diag([1.0, 1.0, handedness])  # a rotation, never a reflection
     T = np.eye(4)
-    T[:3, :3] = U @ S @ Vt
+    T[:3, :3] = nearest_rotation((target - mean_target).T @ (source - mean_source))
     T[:3, 3] = mean_target - T[:3, :3] @ mean_source
     return T
+
+
+def nearest_rotation(covariance: FloatArray) -> FloatArray:
+    """Compute the rotations that align centered points in least squares (Kabsch).
+
+    Args:
+        covariance: [..., 3, 3] sum of target times source transposed.
+
+    Returns:
+        [..., 3, 3], never a reflection.
+    """
+    U, _, Vt = np.linalg.svd(covariance)
+    signs = np.ones(covariance.shape[:-1])
+    signs[..., 2] = np.sign(np.linalg.det(U @ Vt))
+    return np.asarray((U * signs[..., None, :]) @ Vt)
 
 
 def ate(groundtruth: Trajectory, estimate: Trajectory) -> FloatArray:

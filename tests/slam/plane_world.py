@@ -10,9 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import SlamConfig
 from cohdc_train.slam.features.keypoints import Features
+from cohdc_train.slam.frame import FrameResult, PoseCallback, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import exp_se3
+from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.trajectory import Trajectory
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
@@ -135,6 +138,25 @@ def render(
         )
         rgb[seen], nearest[seen], moving[seen] = sampled[seen], depth[seen], item.moving
     return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
+
+
+def slam_config(max_keypoints: int, **options: object) -> SlamConfig:
+    """Options with few keypoints; two underscores stand for a dot: loops__enabled=False."""
+    dotted = {name.replace("__", "."): value for name, value in options.items()}
+    return SlamConfig().override({"features.max_keypoints": max_keypoints, **dotted})
+
+
+def track(
+    slam: Slam,
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    timestamp: float,
+    mask: NDArray[np.bool_] | None = None,
+    depth_timestamp: float | None = None,
+    on_pose: PoseCallback | None = None,
+) -> FrameResult:
+    """Track a frame given as arrays."""
+    return slam.track(RGBDFrame(timestamp, rgb, depth, depth_timestamp), mask, on_pose)
 
 
 def features_at(pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> Features:

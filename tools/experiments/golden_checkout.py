@@ -14,7 +14,12 @@ from typing import NamedTuple
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 # Options of `cohdc` and of tools that got another name. The cases use the old one.
+# Old name: new name; an empty one for an option whose value became positional.
 RENAMED_OPTIONS = {
+    "--sequence": "",
+    "--seed": "--settings.seed",
+    "--view": "--viewer",
+    "--idle": "--idle_timeout",
     "--cloud": "--dense_cloud",
     "--features": "--settings.features.max_keypoints",
     "--culling.dynamic_classes": "--settings.masks.dynamic_classes",
@@ -135,7 +140,8 @@ def translate(arguments: list[str], help_text: str) -> list[str]:
     known = set(re.findall(r"--[\w.]+", help_text))
     renames = {old: new for old, new in RENAMED_OPTIONS.items() if old not in known}
     names_and_values = (word.partition("=") for word in arguments)
-    return [renames.get(name, name) + equals + value for name, equals, value in names_and_values]
+    words = [renames.get(name, name) + equals + value for name, equals, value in names_and_values]
+    return [word for word in words if word]
 
 
 @contextmanager

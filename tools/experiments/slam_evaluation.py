@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Dynamic SLAM scored on rendered sequences with exact ground truth.
+"""Dynamic SLAM scored on rendered sequences whose truth is exact: walks, carts, crowds, a loop,
+plain walls and more.
 
     tools/experiments/slam_evaluation.py --root DIR --out OUT [--model person] [--seeds 0 1 2]
-        [--method loops=false ...]
+        [--settings loops.enabled=false ...]
 
 Renders what is missing of the sequences below DIR (12 of --frames frames, the loop twice as long),
 then runs `cohdc slam` in process on each: without masks ("none"), with the true people ("masks"),
@@ -21,13 +22,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
 import cohdc_train.slam
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import sha256, write_json, write_text
 from cohdc_train.presets import model_path
-from cohdc_train.slam.run import slam
+from cohdc_train.slam.config import SlamConfig
+from cohdc_train.slam.run import run_slam
 from cohdc_train.synth.camera_motion import CameraMotion
 from cohdc_train.synth.scenario import SceneConfig
 from cohdc_train.synth.sequence import sequence
@@ -68,7 +70,7 @@ def main() -> None:
     """Render, run, write."""
     arguments = parse()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    code = digest(Path(cohdc_train.slam.__path__[0]).glob("*.py"))
+    code = digest(Path(cohdc_train.slam.__path__[0]).rglob("*.py"))
     rows, failures = kept(arguments.out / "evaluation.json", code), []
     for name in arguments.sequences:
         frames = KINDS[name].length * arguments.frames
@@ -78,7 +80,7 @@ def main() -> None:
                 "sequence": name,
                 "mode": mode,
                 "seed": seed,
-                "method": asdict(arguments.method),
+                "settings": arguments.settings,
             }
             asked |= {"frames": frames, "size": list(arguments.size), "code": code}
             asked |= {"model": sha256(model_path(arguments.model))} if mode == "model" else {}
@@ -97,10 +99,7 @@ def main() -> None:
 
 
 def parse() -> argparse.Namespace:
-    """Read the command line.
-
-    `method` becomes a Method, `modes` those that can run.
-    """
+    """Return the arguments; `modes` are those that can run."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -116,7 +115,7 @@ def parse() -> argparse.Namespace:
         "--model", type=Path, help="ONNX or a shipped network's name; without it, no mode `model`"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    add_method_option(parser)
+    add_settings_option(parser)
     parser.add_argument("--frames", type=int, default=200, help="of a sequence of length 1")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(480, 640), metavar=("HEIGHT", "WIDTH")
@@ -134,18 +133,18 @@ def parse() -> argparse.Namespace:
 
 
 def digest(files: Iterable[Path]) -> str:
-    """Compute a digest of the tracker's code: rows of other code are not reused."""
+    """Of the tracker's code: rows of other code are not this code's."""
     return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(files))).hexdigest()[:16]
 
 
 def kept(path: Path, code: str) -> list[Row]:
-    """Read the rows of former calls that this code made."""
+    """Rows of former calls that this code made."""
     rows = json.loads(path.read_text()) if path.is_file() else []
     return [row for row in rows if row["code"] == code]
 
 
 def render(folder: Path, kind: Kind, frames: int, size: tuple[int, int]) -> None:
-    """Render a sequence unless it exists. Raises SystemExit when another one does."""
+    """Render a sequence unless it lies there. Raises SystemExit when another one does."""
     wanted = {
         "seed": kind.seed,
         "motion": kind.motion,
@@ -169,7 +168,8 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
     given: Row = {"model": arguments.model} if mode == "model" else {}
     given |= {"masks": folder / mode} if mode in ("masks", "movers") else {}
     out = arguments.out / name / f"{mode}_seed{seed}"
-    metrics = slam(sequence=folder, out=out, seed=seed, method=arguments.method, **given)
+    settings = SlamConfig(seed=seed).override(arguments.settings)
+    metrics = run_slam(folder, out, settings=settings, **given)
     row = {
         error: metrics.get(error, {}).get("rmse") for error in ("ate_m", "rpe_1s_m", "rpe_1s_deg")
     }
@@ -177,13 +177,12 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
 
 
 def tables(rows: list[Row]) -> str:
-    """Format a table per method: ATE RMSE of all sequences and modes, and coverage.
-
-    Median and worst over the seeds.
+    """Return a table per choice of settings: ATE RMSE of every sequence and mode, median and worst over the seeds, and
+    coverage.
     """
     parts = []
-    for method in unique(json.dumps(row["method"]) for row in rows):
-        ours = [row for row in rows if json.dumps(row["method"]) == method]
+    for settings in unique(json.dumps(row["settings"]) for row in rows):
+        ours = [row for row in rows if json.dumps(row["settings"]) == settings]
         modes = [mode for mode in MODES if any(row["mode"] == mode for row in ours)]
         lines = [
             "| ATE RMSE m, median (worst), least coverage | " + " | ".join(modes) + " |",
@@ -195,13 +194,13 @@ def tables(rows: list[Row]) -> str:
                 for mode in modes
             ]
             lines.append(f"| {name} | {' | '.join(cells)} |")
-        switches = ", ".join(f"{key} {value}" for key, value in json.loads(method).items())
-        parts.append(f"### {switches}\n\n" + "\n".join(lines) + "\n")
+        changed = ", ".join(f"{key} {value}" for key, value in json.loads(settings).items())
+        parts.append(f"### {changed or 'default settings'}\n\n" + "\n".join(lines) + "\n")
     return "\n".join(parts)
 
 
 def cell(rows: list[Row]) -> str:
-    """Format the result of one mode on one sequence."""
+    """What one mode did on one sequence."""
     if not rows:
         return "-"
     known = [row["ate_m"] for row in rows if row["ate_m"] is not None]
@@ -210,7 +209,7 @@ def cell(rows: list[Row]) -> str:
 
 
 def unique(names: Iterable[str]) -> list[str]:
-    """List distinct values in the order of their first appearance."""
+    """In the order of their first appearance."""
     return list(dict.fromkeys(names))
 
 
