@@ -18,7 +18,7 @@ from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.loop_closing.loop_closer import LoopCloser, LoopCloserConfig
 from cohdc_train.slam.mapping.frame_history import FrameHistory
-from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames
+from cohdc_train.slam.mapping.global_bundle_adjustment import IntermediateFrames
 from cohdc_train.slam.mapping.local_mapper import LocalMapper, LocalMapperConfig
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.patch_refiner import PatchRefiner
@@ -182,10 +182,10 @@ class Slam:
             incremental,
         )
 
-    def _new_intermediate_frames(self) -> ObservedFrames:
+    def _new_intermediate_frames(self) -> IntermediateFrames:
         """Return an empty store of what frames between keyframes observe."""
         config = self.config
-        return ObservedFrames(config.bundle_adjustment, config.motion.prior_below_points)
+        return IntermediateFrames(config.bundle_adjustment, config.motion.prior_below_points)
 
     def _check(self, frame: RGBDFrame, mask: Mask | None) -> None:
         """Raise DataError for a frame that does not fit the camera or does not follow the last."""

@@ -133,7 +133,9 @@ class SlamNode(Node):
             path = PathMessage()
             path.header.stamp = header.stamp
             path.header.frame_id = "map"
-            path.poses = [stamped_pose(T_wc, header.stamp) for T_wc in point_map.way()]
+            path.poses = [
+                stamped_pose(T_wc, header.stamp) for T_wc in point_map.keyframe_trajectory()
+            ]
             self._path.publish(path)
         mask = result.union_mask
         if mask is not None:

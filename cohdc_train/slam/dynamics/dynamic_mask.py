@@ -47,7 +47,7 @@ class DynamicMaskEstimator:
         config = self._config
         neighbors = sorted(neighbors, key=lambda keyframe: keyframe.index)
         current = _select_evenly(neighbors, config.reference_keyframes)
-        old = [k for k in neighbors if k.t <= timestamp - config.rest_s]
+        old = [k for k in neighbors if k.timestamp <= timestamp - config.rest_s]
         old = _select_evenly(old, config.reference_keyframes)
         comparison = _Comparisons(self._checker, depth, T_cw, [*current, *old])
         with_old = comparison.with_keyframes(old)
@@ -70,7 +70,9 @@ class DynamicMaskEstimator:
     ) -> NDArray[np.bool_]:
         """Return the cells [h, w] that move, extended to whole surfaces."""
         depth = comparison.depth
-        recent = [k for k in comparison.keyframes if k.t <= timestamp - self._config.recent_s]
+        recent = [
+            k for k in comparison.keyframes if k.timestamp <= timestamp - self._config.recent_s
+        ]
         moving = self._checker.find_moving(comparison.with_keyframes(current))
         masked = np.zeros_like(moving) if mask is None else self._checker.downsample(mask)
         # Without a keyframe of that age all cells count as static, so no surface is extended.
@@ -95,7 +97,7 @@ class _Comparisons:
     ) -> None:
         self.keyframes = list({keyframe.index: keyframe for keyframe in keyframes}.values())
         self._row = {keyframe.index: row for row, keyframe in enumerate(self.keyframes)}
-        references = [ReferenceDepth(k.T_cw, k.nearest) for k in self.keyframes]
+        references = [ReferenceDepth(k.T_cw, k.min_depth_grid) for k in self.keyframes]
         self._all = checker.compare(depth, T_cw, references)
         self.depth = self._all.depth
 

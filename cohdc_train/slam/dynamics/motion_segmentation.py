@@ -122,7 +122,7 @@ def find_moving_cluster(
     clusters = nested_clusters(local, track_lengths, config)
     error = residuals(local, observed, reprojection)
     jacobian = pose_jacobian(local, residual_jacobian(local, observed, reprojection))
-    poses = _poses_without(clusters, jacobian, error, observed.limits)
+    poses = _poses_without(clusters, jacobian, error, observed.chi2_thresholds)
 
     best, best_score = nothing, 0.0
     limit = config.min_median_chi2

@@ -50,14 +50,14 @@ class Keypoints:
 class Features:
     """Keypoints of one frame with undistorted positions and depth.
 
-    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n]
+    pixels: [n, 2] float64 as measured, px; undistorted: [n, 2] float64 px, as a pinhole camera would measure them; octaves: [n]
     int64 pyramid level; descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where
     there is no reading or it is refused; is_subpixel: [n] bool, refined by the patch of its point;
     pyramid: the levels that octaves count.
     """
 
     pixels: NDArray[np.float64]
-    points: NDArray[np.float64]
+    undistorted: NDArray[np.float64]
     octaves: NDArray[np.int64]
     descriptors: NDArray[np.uint64]
     depths: NDArray[np.float64]
@@ -68,7 +68,7 @@ class Features:
         n = len(self.pixels)
         arrays = (
             self.pixels,
-            self.points,
+            self.undistorted,
             self.octaves,
             self.descriptors,
             self.depths,

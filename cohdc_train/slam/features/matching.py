@@ -12,19 +12,20 @@ from cohdc_train.slam.features.keypoints import Features
 
 @dataclass(frozen=True)
 class Matches:
-    """points: [m] int64 map point ids; corners: [m] int64 rows of the frame's features. Both
-    without repetition.
+    """Map points matched with keypoints of a frame, one to one.
+
+    point_ids: [m] int64 map points; keypoints: [m] int64 rows of the frame's features.
     """
 
-    points: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
     keypoints: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self.point_ids)
 
     def take(self, rows: NDArray[np.bool_]) -> "Matches":
         """The chosen rows."""
-        return Matches(self.points[rows], self.keypoints[rows])
+        return Matches(self.point_ids[rows], self.keypoints[rows])
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def match_projected(
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     reach = radius_px * np.minimum(features.scales, config.max_radius_scale)
     i, j = _neighbors(projected, features, float(reach.max()))
-    x, y = projected.pixels.T.take(i, axis=1) - features.points.T.take(j, axis=1)
+    x, y = projected.pixels.T.take(i, axis=1) - features.undistorted.T.take(j, axis=1)
     near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])
     i, j = i[near], j[near]
     bits = hamming(projected.descriptors[i], features.descriptors[j])
@@ -77,8 +78,8 @@ def _neighbors(
     a point looks are then one piece of the sorted list; there are nine such pieces, of three rows
     on three levels.
     """
-    keypoint = features.points.min(axis=0) - reach
-    cells = ((features.points - keypoint) / reach).astype(
+    keypoint = features.undistorted.min(axis=0) - reach
+    cells = ((features.undistorted - keypoint) / reach).astype(
         np.int64
     )  # from 1 on: a rim of empty cells lies around
     width, height = (cells.max(axis=0) + 2).tolist()

@@ -35,7 +35,7 @@ class Pyramid:
         """
         result = np.empty((len(pixels), side * side), dtype=np.float32)
         height, width = self.levels[0].shape
-        shift, (right, down) = np.broadcast_to(shift, pixels.shape), square(side)
+        shift, (right, down) = np.broadcast_to(shift, pixels.shape), patch_grid(side)
         for level in np.unique(octaves).tolist():
             rows = np.flatnonzero(octaves == level)
             image = self.levels[level]
@@ -46,13 +46,13 @@ class Pyramid:
         return result
 
 
-def square(side: int) -> Floats:
+def patch_grid(side: int) -> Floats:
     """[2, side * side] offsets x and y of a square's pixels from its middle, px, row by row."""
     places = np.arange(side, dtype=np.float32) - (side - 1) / 2
     return np.stack([np.tile(places, side), np.repeat(places, side)])
 
 
-def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
+def warp_patches(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
     """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image,
     at their levels.
     """
@@ -61,7 +61,9 @@ def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
     for start in range(0, len(patches), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
         column = patches[some].reshape(-1, patch_px).astype(np.float32)  # one patch below the other
-        places = inverse[some].astype(np.float32) @ square(side) + np.float32((patch_px - 1) / 2)
+        places = inverse[some].astype(np.float32) @ patch_grid(side) + np.float32(
+            (patch_px - 1) / 2
+        )
         x, y = np.clip(places, 0, patch_px - 1).transpose(1, 0, 2)
         y += patch_px * np.arange(len(y), dtype=np.float32)[:, None]
         result[some] = cv2.remap(column, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

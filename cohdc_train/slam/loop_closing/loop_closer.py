@@ -117,7 +117,7 @@ class LoopCloser:
         if len(keyframes) <= config.min_gap_keyframes:
             return []
         similarity = self._places.similarity(keyframe.features.descriptors)
-        num_shared = self._map.shared(keyframe.seen_points(), keyframes)
+        num_shared = self._map.shared(keyframe.observed_point_ids(), keyframes)
 
         # Neighbors are no loop, but a loop must look as similar as they do.
         is_neighbor = num_shared >= config.covisible_points
@@ -176,15 +176,15 @@ class LoopCloser:
         """Fuse the points that both sides of a loop observe, and adjust the newest keyframes."""
         point_map, limit = self._map, self._config.fuse_keyframes
         newest = point_map.keyframes[-1]
-        old_side = point_map.covisible(point_map.anchor(loop.old)[0].seen_points(), limit)
-        for keyframe in point_map.covisible(newest.seen_points(), limit):
+        old_side = point_map.covisible(point_map.anchor(loop.old)[0].observed_point_ids(), limit)
+        for keyframe in point_map.covisible(newest.observed_point_ids(), limit):
             fuse_into(point_map, point_map.points_of(old_side), keyframe, point_map.keyframes)
         adjust_window(point_map, newest, self._reprojection, self._bundle_adjustment)
 
 
 def _count_shared_points(point_map: Map) -> IntArray:
     """Count the points that each two keyframes share: [k, k]."""
-    observed = [keyframe.seen_points() for keyframe in point_map.keyframes]
+    observed = [keyframe.observed_point_ids() for keyframe in point_map.keyframes]
     row_starts = np.concatenate([[0], np.cumsum([len(ids) for ids in observed])])
     ones = np.ones(int(row_starts[-1]), dtype=np.int64)
     shape = (len(observed), point_map.size)

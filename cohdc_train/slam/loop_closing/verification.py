@@ -81,7 +81,7 @@ class LoopVerifier:
             The loop, or None where points, neighbors or images contradict it.
         """
         config = self._config
-        ids = old.seen_points()
+        ids = old.observed_point_ids()
         place = self._map.points_of(self._map.covisible(ids, config.place_keyframes))
         T_cw = self._locate(keyframe, ids, place)
         if T_cw is None:
@@ -121,7 +121,7 @@ class LoopVerifier:
             projected = point_map.project(place, T_cw)
             matches = match_projected(projected, features, radius, self._matching)
             observed = observations(features, matches.keypoints)
-            points = point_map.positions[matches.points]
+            points = point_map.positions[matches.point_ids]
             T_cw, inlier = optimize_pose(T_cw, points, observed, self._reprojection)
             num_inliers = int(inlier.sum())
         return T_cw if num_inliers >= config.min_inliers else None
@@ -129,7 +129,7 @@ class LoopVerifier:
     def _solve_rough(self, features: Features, matches: Matches) -> Array | None:
         """Estimate a pose T_cw [4, 4] from descriptor matches alone, or return None."""
         config = self._config
-        points = self._map.positions[matches.points]
+        points = self._map.positions[matches.point_ids]
         observed = observations(features, matches.keypoints)
         if len(matches) < config.min_inliers_rough:
             return None
@@ -157,7 +157,7 @@ class LoopVerifier:
             Neighbors, each with its own pose T_cw [4, 4] in the old place.
         """
         config = self._config
-        covisible = self._map.covisible(keyframe.seen_points(), config.neighbors + 1)
+        covisible = self._map.covisible(keyframe.observed_point_ids(), config.neighbors + 1)
         neighbors = [neighbor for neighbor in covisible if neighbor is not keyframe]
         agreeing = []
         for neighbor in neighbors[: config.neighbors]:

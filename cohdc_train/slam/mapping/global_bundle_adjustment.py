@@ -17,8 +17,8 @@ from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.frame_history import FrameHistory
 from cohdc_train.slam.mapping.keyframe import observations
 from cohdc_train.slam.mapping.local_bundle_adjustment import (
-    Sighting,
-    close_window,
+    FrameObservations,
+    apply_solution,
     select_window,
     solve,
 )
@@ -27,7 +27,7 @@ from cohdc_train.slam.optimization.reprojection import Observations, Reprojectio
 
 
 class _Kept(NamedTuple):
-    """row: of the frame in the log; ids: [m] points that it saw; born: [m] keyframe index of each,
+    """row: of the frame in the history; ids: [m] points that it saw; born: [m] keyframe index of each,
     for a younger point may take the row of one that is gone; seen: the m measurements."""
 
     row: int
@@ -36,7 +36,7 @@ class _Kept(NamedTuple):
     seen: Observations
 
 
-class ObservedFrames:
+class IntermediateFrames:
     """Frames by what they saw of the map, evenly thinned: so many are kept that memory is bounded."""
 
     def __init__(self, config: BundleAdjustmentConfig, min_points: int) -> None:
@@ -53,7 +53,7 @@ class ObservedFrames:
         matches: Matches,
         from_map: bool,
         features_of: Callable[[Matches], Features],
-        world: Map,
+        point_map: Map,
     ) -> None:
         """Add the next tracked frame, of which all, some, or no measurements are kept.
 
@@ -69,50 +69,57 @@ class ObservedFrames:
             return
         # Odd and even in turns, whichever powers of two are left out later on.
         turn = number.bit_count()
-        kept = matches.take((matches.points + turn) % turns == 0)
+        kept = matches.take((matches.point_ids + turn) % turns == 0)
         seen = observations(features_of(kept), kept.keypoints)
-        self._kept.append(_Kept(row, kept.points, world.first_keyframe[kept.points], seen))
+        self._kept.append(
+            _Kept(row, kept.point_ids, point_map.first_keyframe[kept.point_ids], seen)
+        )
         if len(self._kept) > self._config.max_frames:
             self._kept = self._kept[::2]
             self._every *= 2
 
-    def adjust(self, world: Map, reprojection: ReprojectionModel, log: FrameHistory) -> None:
+    def adjust(
+        self, point_map: Map, reprojection: ReprojectionModel, history: FrameHistory
+    ) -> None:
         """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are
-        moved in the log; others stay where they lie from their reference keyframes.
+        moved in the history; others stay where they lie from their reference keyframes.
 
         Without the first step a map that loops have moved is still too far off when the few of the
         second are over.
         """
-        adjust_everything(world, reprojection, self._config)
-        stamps, keyframes = log.stamps, {keyframe.t for keyframe in world.keyframes}
+        adjust_everything(point_map, reprojection, self._config)
+        stamps, keyframes = (
+            history.timestamps,
+            {keyframe.timestamp for keyframe in point_map.keyframes},
+        )
         others = [kept for kept in self._kept if stamps[kept.row] not in keyframes]
         if not others:
             return
-        poses = log.poses(world)
-        sightings = [_sighting(kept, poses[kept.row], world) for kept in others]
-        adjusted = adjust_everything(world, reprojection, self._config, sightings)
-        log.put(world, [kept.row for kept in others], adjusted)
+        poses = history.poses(point_map)
+        observed = [_frame_observations(kept, poses[kept.row], point_map) for kept in others]
+        adjusted = adjust_everything(point_map, reprojection, self._config, observed)
+        history.update_poses(point_map, [kept.row for kept in others], adjusted)
 
 
-def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
+def _frame_observations(kept: _Kept, T_cw: Array, point_map: Map) -> FrameObservations:
     """What a frame saw of points that are still there."""
-    same = np.flatnonzero(world.first_keyframe[kept.ids] == kept.first_keyframe)
-    ids = world.current(kept.ids[same])
-    there = np.flatnonzero(world.num_observations[ids] > 0)
+    same = np.flatnonzero(point_map.first_keyframe[kept.ids] == kept.first_keyframe)
+    ids = point_map.resolve_merged(kept.ids[same])
+    there = np.flatnonzero(point_map.num_observations[ids] > 0)
     ids, first = np.unique(ids[there], return_index=True)
-    return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))
+    return FrameObservations(T_cw, ids, kept.seen.take(same[there[first]]))
 
 
 def adjust_everything(
-    world: Map,
+    point_map: Map,
     reprojection: ReprojectionModel,
     config: BundleAdjustmentConfig,
-    sightings: Sequence[Sighting] = (),
+    observed: Sequence[FrameObservations] = (),
 ) -> Array:
     """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first
     keyframe holds still. Returns [s, 4, 4] T_cw of those frames, m."""
-    window = select_window(world, list(world.keyframes), 1, sightings)
+    window = select_window(point_map, list(point_map.keyframes), 1, observed)
     poses = np.stack(window.poses)
     solution = solve(poses, window.points, window.problem, reprojection, config)
-    close_window(world, window, solution)
+    apply_solution(point_map, window, solution)
     return solution.poses[len(window.keyframes) :]

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from cohdc_train.slam.config import KeyframeCullingConfig
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.map_points import drop_points
+from cohdc_train.slam.mapping.map_points import remove_points
 
 _UNSEEN = 100  # level of a point that a keyframe does not observe
 
 
 def cull_keyframes(
-    world: Map,
+    point_map: Map,
     newest: Keyframe,
     keep: set[int],
     config: KeyframeCullingConfig,
@@ -28,10 +28,10 @@ def cull_keyframes(
     that share most points with the newest, and those of the indices `keep`. Younger ones go first.
     The keyframe that shares most points with a removed one is its successor. Returns the removed.
     """
-    around = world.covisible(newest.seen_points(), config.neighborhood)
-    ids = world.points_of(around)
-    levels = _levels(ids, around, world.size)
-    keep = keep | {world.keyframes[0].index, newest.index}
+    around = point_map.covisible(newest.observed_point_ids(), config.neighborhood)
+    ids = point_map.points_of(around)
+    levels = _levels(ids, around, point_map.size)
+    keep = keep | {point_map.keyframes[0].index, newest.index}
     rows = [row for row in range(num_protected, len(around)) if around[row].index not in keep]
     removed = []
     for row in sorted(rows, key=lambda row: -around[row].index):
@@ -41,7 +41,7 @@ def cull_keyframes(
         num_redundant = np.count_nonzero(num_others >= config.min_other_observers)
         if num_redundant >= config.redundancy_ratio * len(own):
             levels[row] = _UNSEEN
-            _remove(world, around[row])
+            _remove(point_map, around[row])
             removed.append(around[row])
     return removed
 
@@ -57,10 +57,12 @@ def _levels(ids: NDArray[np.int64], keyframes: list[Keyframe], size: int) -> NDA
     return levels
 
 
-def _remove(world: Map, keyframe: Keyframe) -> None:
-    points = keyframe.seen_points()
+def _remove(point_map: Map, keyframe: Keyframe) -> None:
+    points = keyframe.observed_point_ids()
     successor = next(
-        (k for k in world.covisible(points, 2) if k is not keyframe), world.keyframes[0]
+        (k for k in point_map.covisible(points, 2) if k is not keyframe), point_map.keyframes[0]
     )
-    world.remove_keyframe(keyframe, successor)
-    drop_points(world, points[world.num_observations[points] < world.config.min_observations])
+    point_map.remove_keyframe(keyframe, successor)
+    remove_points(
+        point_map, points[point_map.num_observations[points] < point_map.config.min_observations]
+    )

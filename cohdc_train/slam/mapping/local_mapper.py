@@ -14,7 +14,7 @@ from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
 from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.map_points import add_points, cull, fuse
+from cohdc_train.slam.mapping.map_points import add_points, cull_map_points, fuse
 from cohdc_train.slam.mapping.patch_refiner import PatchRefiner
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
@@ -55,7 +55,7 @@ class LocalMapper:
 
     def __init__(
         self,
-        world: Map,
+        point_map: Map,
         reprojection: ReprojectionModel,
         config: LocalMapperConfig,
         refiner: PatchRefiner | None,
@@ -63,7 +63,7 @@ class LocalMapper:
         executor: Executor | None,
         incremental: bool,
     ) -> None:
-        self._world, self._reprojection = world, reprojection
+        self._map, self._reprojection = point_map, reprojection
         self._config = config
         self._mapper = (
             None
@@ -96,8 +96,8 @@ class LocalMapper:
         first.
         """
         self._run_all_tasks()
-        self._world.add_keyframe(keyframe)
-        add_points(self._world, keyframe, self._config.max_depth_m)
+        self._map.add_keyframe(keyframe)
+        add_points(self._map, keyframe, self._config.max_depth_m)
         if self._refiner is not None and patches is not None:
             self._refiner.store(keyframe, patches)
         self._tasks.extend(
@@ -114,28 +114,28 @@ class LocalMapper:
     def apply_finished_adjustment(self) -> None:
         """Apply a bundle adjustment that has finished in parallel. Keyframes may move."""
         if self._mapper is not None:
-            self._mapper.collect(self._world)
+            self._mapper.collect(self._map)
 
     def finish(self) -> None:
         """Run all tasks, and wait for bundle adjustment."""
         self._run_all_tasks()
         if self._mapper is not None:
-            self._mapper.finish(self._world)
+            self._mapper.finish(self._map)
 
     def _run_all_tasks(self) -> None:
         while self._tasks:
             self.run_next_task()
 
     def _settle(self, keyframe: Keyframe) -> None:
-        if len(self._world.keyframes) == 1:
+        if len(self._map.keyframes) == 1:
             return
-        fuse(self._world, keyframe)
+        fuse(self._map, keyframe)
         if self._mapper is None:
             config = self._config.bundle_adjustment
-            adjust_window(self._world, keyframe, self._reprojection, config)
+            adjust_window(self._map, keyframe, self._reprojection, config)
         else:
-            self._mapper.start(self._world, keyframe)
-        cull(self._world, keyframe.index)
+            self._mapper.start(self._map, keyframe)
+        cull_map_points(self._map, keyframe.index)
 
     def _look_back(self, keyframe: Keyframe, make_image: Callable[[int], DepthImage]) -> None:
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
@@ -145,6 +145,6 @@ class LocalMapper:
         culling = self._config.keyframe_culling
         if culling.enabled:
             window = self._config.bundle_adjustment.local_keyframes
-            for removed in cull_keyframes(self._world, keyframe, in_use, culling, window):
+            for removed in cull_keyframes(self._map, keyframe, in_use, culling, window):
                 if self._loops is not None:
                     self._loops.forget(removed)

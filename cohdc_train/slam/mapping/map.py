@@ -35,7 +35,7 @@ class Map:
         self.matching = matching
         self._static_odds = static_odds
         self.keyframes: list[Keyframe] = []
-        self.joined = 0
+        self.num_inserted = 0
         self._by_index: dict[int, Keyframe] = {}
         self._successors: dict[
             int, tuple[int, Array]
@@ -46,7 +46,7 @@ class Map:
         self.directions = np.zeros(
             (1024, 3)
         )  # sum of unit vectors from camera centres to the point
-        self.reach = np.zeros(
+        self.max_distance_m = np.zeros(
             1024
         )  # m: from further away not even the finest level shows the point
         self.num_observations = np.zeros(1024, dtype=np.int64)  # keyframes
@@ -56,14 +56,16 @@ class Map:
         self.merged_into = np.full(1024, -1)  # the point that took over the one in this row
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
         self.found = np.zeros(1024, dtype=np.int64)  # frames that did
-        self.moved = np.zeros(1024)  # log-odds against standing still, beyond those of a new point
+        self.moving_log_odds = np.zeros(
+            1024
+        )  # log-odds against standing still, beyond those of a new point
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
         self.keyframes.append(keyframe)
         self._by_index[keyframe.index] = keyframe
-        self.joined = keyframe.index + 1
-        self._add_observer(keyframe.seen_points(), keyframe)
+        self.num_inserted = keyframe.index + 1
+        self._add_observer(keyframe.observed_point_ids(), keyframe)
 
     def remove_keyframe(self, keyframe: Keyframe, successor: Keyframe) -> None:
         """Take out a keyframe; what hung on it, frames and points, hangs on another from now on,
@@ -93,22 +95,22 @@ class Map:
         keyframe, T = self.anchor(index)
         return np.asarray(T @ keyframe.T_cw)
 
-    def way(self) -> Array:
+    def keyframe_trajectory(self) -> Array:
         """[joined, 4, 4] T_wc, m, of all keyframes, removed ones too."""
-        return inverse(np.stack([self.pose(index) for index in range(self.joined)]))
+        return inverse(np.stack([self.pose(index) for index in range(self.num_inserted)]))
 
     def add_points(self, keyframe: Keyframe, keypoints: NDArray[np.int64]) -> None:
         """New points at the depth that was measured at corners of a keyframe."""
         features, count = keyframe.features, len(keypoints)
         ids = self._free_rows(count)
-        local = self.camera.backproject(features.points[keypoints], features.depths[keypoints])
+        local = self.camera.backproject(features.undistorted[keypoints], features.depths[keypoints])
         self.positions[ids] = (local - keyframe.T_cw[:3, 3]) @ keyframe.T_cw[:3, :3]
         self.descriptors[ids] = features.descriptors[keypoints]
-        self.reach[ids] = np.linalg.norm(local, axis=1) * features.scales[keypoints]
+        self.max_distance_m[ids] = np.linalg.norm(local, axis=1) * features.scales[keypoints]
         self.first_keyframe[ids] = keyframe.index
         self.merged_into[ids] = -1
         self.directions[ids] = 0.0
-        self.moved[ids] = 0.0
+        self.moving_log_odds[ids] = 0.0
         self.visible[ids] = self.found[ids] = 1
         self.observe(keyframe, Matches(ids, keypoints))
 
@@ -116,9 +118,9 @@ class Map:
         """Corners of a keyframe, free so far, are measurements of points, held against none of
         their patches.
         """
-        keyframe.point_ids[matches.keypoints] = matches.points
+        keyframe.point_ids[matches.keypoints] = matches.point_ids
         keyframe.features = keyframe.features.marked_subpixel(matches.keypoints, False)
-        self._add_observer(matches.points, keyframe)
+        self._add_observer(matches.point_ids, keyframe)
 
     def forget(self, keyframe: Keyframe, keypoints: NDArray[np.int64]) -> None:
         """Corners of a keyframe are no measurements of their points."""
@@ -138,7 +140,7 @@ class Map:
         The log-odds of having moved become the larger of both: the same frames have judged them, so
         that their sum would count what a group did twice.
         """
-        np.maximum.at(self.moved, new, self.moved[old])
+        np.maximum.at(self.moving_log_odds, new, self.moving_log_odds[old])
         self.merged_into[old] = new
         alias = np.arange(self.size + 1)
         alias[old] = new
@@ -156,7 +158,7 @@ class Map:
             keep = keypoint[successors] == changed
             self.observe(keyframe, Matches(successors[keep], changed[keep]))
 
-    def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def resolve_merged(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """[n] what the points `ids` have become, by however many steps: themselves where none took
         them over.
         """
@@ -170,23 +172,29 @@ class Map:
                 return ids
             ids = np.where(taken, successors, ids)
 
-    def trust(self, ids: NDArray[np.int64]) -> Array:
+    def static_weight(self, ids: NDArray[np.int64]) -> Array:
         """[n] probability that each point stands still, as a share of a new point's: its weight,
         above 0 up to 1.
         """
         prior = self._static_odds.static_log_odds
-        return np.asarray((1 + np.exp(-prior)) / (1 + np.exp(self.moved[ids] - prior)))
+        return np.asarray((1 + np.exp(-prior)) / (1 + np.exp(self.moving_log_odds[ids] - prior)))
 
     def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
         """Where the map has the matched points, [m, 3] m, and what a frame measured of them."""
-        seen = observations(features, matches.keypoints).trusted(self.trust(matches.points))
-        return self.positions[matches.points], seen
+        seen = observations(features, matches.keypoints).weighted(
+            self.static_weight(matches.point_ids)
+        )
+        return self.positions[matches.point_ids], seen
 
     def update_static_odds(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
         """A frame has seen points stand still, and others move with a group that does not."""
         odds = self._static_odds
-        self.moved[still] = np.maximum(self.moved[still] - odds.static_step, 0.0)
-        self.moved[moving] = np.minimum(self.moved[moving] + odds.moving_step, odds.max_log_odds)
+        self.moving_log_odds[still] = np.maximum(
+            self.moving_log_odds[still] - odds.static_step, 0.0
+        )
+        self.moving_log_odds[moving] = np.minimum(
+            self.moving_log_odds[moving] + odds.moving_step, odds.max_log_odds
+        )
 
     def shared(self, ids: NDArray[np.int64], keyframes: list[Keyframe]) -> NDArray[np.int64]:
         """[keyframes] how many of the points each of them sees."""
@@ -264,7 +272,9 @@ class Map:
         along = np.einsum(
             "nj,nj->n", local @ T_cw[:3, :3], sums
         )  # cosine times distance times length of the sum
-        level = np.log(np.maximum(self.reach[ids], 1e-9) / distance) / np.log(self.pyramid.factor)
+        level = np.log(np.maximum(self.max_distance_m[ids], 1e-9) / distance) / np.log(
+            self.pyramid.factor
+        )
         length = np.sqrt(np.einsum("nj,nj->n", sums, sums))
         seen = along > self.matching.min_view_cosine * distance * length
         seen &= (level > -1.0) & (level < num_levels)
@@ -297,9 +307,9 @@ class Map:
             "merged_into",
             "visible",
             "found",
-            "moved",
+            "moving_log_odds",
         )
-        names = ("positions", "descriptors", "directions", "reach", *counters)
+        names = ("positions", "descriptors", "directions", "max_distance_m", *counters)
         while len(self.positions) < count:
             for name in names:
                 array = getattr(self, name)

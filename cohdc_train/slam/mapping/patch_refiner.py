@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cohdc_train.slam.config import RefinementConfig
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.patch_alignment import Pyramid, align, warped
+from cohdc_train.slam.features.patch_alignment import Pyramid, align, warp_patches
 from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
@@ -28,15 +28,15 @@ class PatchRefiner:
     Points of the coarsest keypoints have no patch.
     """
 
-    def __init__(self, world: Map, config: RefinementConfig) -> None:
-        self._world = world
+    def __init__(self, point_map: Map, config: RefinementConfig) -> None:
+        self._map = point_map
         self._config = config
         self._patches = np.zeros((0, config.patch_px, config.patch_px), dtype=np.uint8)
         self._octaves = np.zeros(0, dtype=np.int64)
 
     def pyramid(self, gray: NDArray[np.uint8]) -> Pyramid:
         """Return the image pyramid of a frame [H, W] that `store` and `refine` take."""
-        scale = self._world.pyramid
+        scale = self._map.pyramid
         return Pyramid(gray, scale, min(self._config.max_level, scale.num_levels - 1))
 
     def store(self, keyframe: Keyframe, pyramid: Pyramid) -> None:
@@ -44,9 +44,9 @@ class PatchRefiner:
 
         pyramid: of the keyframe's image. The keypoints of these points are marked as refined.
         """
-        self._reserve(len(self._world.positions))
+        self._reserve(len(self._map.positions))
         side = self._config.patch_px
-        first_keyframe = self._world.first_keyframe
+        first_keyframe = self._map.first_keyframe
         # Blank, or a point without a patch would have that of the point whose row it took.
         self._patches[first_keyframe[: len(self._patches)] == keyframe.index] = 0
 
@@ -70,21 +70,21 @@ class PatchRefiner:
         matches = matches.take(features.octaves[matches.keypoints] <= self._config.max_level)
         if len(matches) == 0:
             return features
-        ids, keypoints = matches.points, matches.keypoints
-        octaves, scale = features.octaves[keypoints], self._world.pyramid
-        A = affine(self._world, ids, T_cw)
+        ids, keypoints = matches.point_ids, matches.keypoints
+        octaves, scale = features.octaves[keypoints], self._map.pyramid
+        A = affine(self._map, ids, T_cw)
         back = np.linalg.inv(A) * scale.scales(octaves - self._octaves[ids])[:, None, None]
-        template = warped(self._patches[ids], back, self._config.template_px + 2)
+        template = warp_patches(self._patches[ids], back, self._config.template_px + 2)
         shift, good = align(pyramid, features.pixels[keypoints], octaves, template, self._config)
         rows = keypoints[good]
-        pixels, points = features.pixels.copy(), features.points.copy()
+        pixels, undistorted = features.pixels.copy(), features.undistorted.copy()
         pixels[rows] += shift[good] * scale.scales(octaves[good, None])
         # The difference, for points may be corrected for the rolling shutter.
-        undistort = self._world.camera.undistort
-        points[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
+        undistort = self._map.camera.undistort
+        undistorted[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
         is_subpixel = np.zeros(len(features), dtype=np.bool_)
         is_subpixel[rows] = True
-        return replace(features, pixels=pixels, points=points, is_subpixel=is_subpixel)
+        return replace(features, pixels=pixels, undistorted=undistorted, is_subpixel=is_subpixel)
 
     def _reserve(self, count: int) -> None:
         """Make room for as many points as the map has, which doubles its arrays."""
@@ -95,13 +95,13 @@ class PatchRefiner:
             self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
 
 
-def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
+def affine(point_map: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
     """A of eq. 9 for n points: [n, 2, 2] px of a camera at T_cw per px of the keyframe where each
     was first seen.
     """
-    camera, points = world.camera, world.positions[ids]
-    first_keyframe, which = np.unique(world.first_keyframe[ids], return_inverse=True)
-    T_bw = np.stack([world.pose(index) for index in first_keyframe.tolist()])[which]
+    camera, points = point_map.camera, point_map.positions[ids]
+    first_keyframe, which = np.unique(point_map.first_keyframe[ids], return_inverse=True)
+    T_bw = np.stack([point_map.pose(index) for index in first_keyframe.tolist()])[which]
     depth = (
         np.einsum("nj,nj->n", T_bw[:, 2, :3], points) + T_bw[:, 2, 3]
     )  # in the keyframe of its birth

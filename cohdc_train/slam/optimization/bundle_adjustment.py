@@ -119,7 +119,7 @@ def _cost(
     chi2 = np.einsum("mi,mi->m", error, error)
     if not robust:
         return float(chi2.sum())
-    limits = problem.seen.limits
+    limits = problem.seen.chi2_thresholds
     return float(np.where(chi2 <= limits, chi2, 2 * np.sqrt(limits * chi2) - limits).sum())
 
 
@@ -130,7 +130,9 @@ def _normal_equations(
     error = residuals(local, problem.seen, reprojection)
     derivative = residual_jacobian(local, problem.seen, reprojection)
     if robust:
-        weight = np.sqrt(huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.limits))
+        weight = np.sqrt(
+            huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.chi2_thresholds)
+        )
         error, derivative = error * weight[:, None], derivative * weight[:, None, None]
     by_pose = pose_jacobian(local, derivative)
     by_point = derivative @ poses[problem.cameras, :3, :3]

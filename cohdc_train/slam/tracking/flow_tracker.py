@@ -97,7 +97,7 @@ class FlowTracker:
         """
         if len(estimate.matches) < self._config.min_inliers:
             return None
-        ids = estimate.matches.points
+        ids = estimate.matches.point_ids
         keypoints = estimate.features.keypoints(estimate.matches.keypoints)
         offsets = keypoints.pixels - self._project(estimate.T_cw, ids)
         under_mask = _is_covered(keypoints.pixels, mask)
@@ -141,7 +141,7 @@ class FlowTracker:
 
         # Points may have been merged since: each is tracked once, and a merged one is not refined.
         known = start.point_ids[rows]
-        ids, first = np.unique(self.map.current(known), return_index=True)
+        ids, first = np.unique(self.map.resolve_merged(known), return_index=True)
         rows, is_same = rows[first], ids == known[first]
         keypoints = start.keypoints.take(rows)
         is_subpixel = keypoints.is_subpixel & is_same

@@ -31,11 +31,11 @@ class KeyframePolicy:
         num_tracked = len(estimate.matches)
 
         # A place that the map knows gets a keyframe only when it looks different now.
-        oldest_new = point_map.joined - config.known_point_age
+        oldest_new = point_map.num_inserted - config.known_point_age
         is_old = point_map.first_keyframe[: point_map.size] < oldest_new
-        num_old = np.count_nonzero(is_old[estimate.matches.points])
+        num_old = np.count_nonzero(is_old[estimate.matches.point_ids])
         if num_old >= config.known_place_ratio * num_tracked:
-            num_old_in_reference = float(is_old[estimate.reference.seen_points()].sum())
+            num_old_in_reference = float(is_old[estimate.reference.observed_point_ids()].sum())
             return num_tracked < config.min_known_ratio * num_old_in_reference
 
         # Elsewhere: tracking has become weak, or the last keyframe is long ago.

@@ -87,7 +87,7 @@ class Localizer:
         best = np.argsort(-similarity, kind="stable")[: config.relocalization_candidates - 1]
         order = [*best.tolist(), len(similarity) - 1]
         for index in dict.fromkeys(order):
-            ids = self.map.keyframes[index].seen_points()
+            ids = self.map.keyframes[index].observed_point_ids()
             descriptors = self.map.descriptors[ids]
             matches = match_descriptors(ids, descriptors, frame.features, self._config.matching)
             hypotheses = self._config.ransac.hypotheses_relocalization
@@ -105,7 +105,7 @@ class Localizer:
         Outliers stay matched, unless they belong to a moving cluster. The prior counts if it did
         in the estimate: a relocalized pose speaks against it.
         """
-        ids = estimate.matches.points
+        ids = estimate.matches.point_ids
         points, seen = self.map.measured(estimate.matches, frame.features)
         segments_motion = self._config.motion_segmentation.enabled
         if segments_motion:
@@ -153,7 +153,7 @@ class Localizer:
             (last.T_cw, config.radius_last_pose_px),
         )
         for guess, radius in attempts:
-            projected = self.map.project(last.matches.points, guess)
+            projected = self.map.project(last.matches.point_ids, guess)
             matches = match_projected(projected, frame.features, radius, self._config.matching)
             rough = self._solve(frame, matches, guess, self._config.ransac.hypotheses)
             if rough is not None:
@@ -192,7 +192,7 @@ class Localizer:
     ) -> PoseEstimate | None:
         """Return the pose by all points of the keyframes around, None where few agree."""
         config = self._config.tracking
-        keyframes = self.map.covisible(rough.matches.points, config.local_keyframes)
+        keyframes = self.map.covisible(rough.matches.point_ids, config.local_keyframes)
         projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
         radius = config.radius_local_map_px
         matches = match_projected(projected, frame.features, radius, self._config.matching)
@@ -203,9 +203,9 @@ class Localizer:
         if num_inliers < min_inliers:
             return None
         matches = matches.take(inlier)
-        reference = self.map.covisible(matches.points, 1)
+        reference = self.map.covisible(matches.point_ids, 1)
         if not reference:  # no keyframe is remembered that observes one of them
             return None
         self.map.visible[projected.ids] += 1
-        self.map.found[matches.points] += 1
+        self.map.found[matches.point_ids] += 1
         return PoseEstimate(T_cw, matches, frame, num_inliers, reference[0], prior)

@@ -56,4 +56,4 @@ class PoseEstimate:
     @property
     def prior_gradient(self) -> Array:
         """Gradient [6] of the prior at the pose, 0 where it did not count."""
-        return np.zeros(6) if self.prior is None else self.prior.pull(self.T_cw)
+        return np.zeros(6) if self.prior is None else self.prior.gradient(self.T_cw)

@@ -19,7 +19,7 @@ from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.depth_image import make_depth_image
 from cohdc_train.slam.geometry.se3 import inverse
 from cohdc_train.slam.mapping.frame_history import FrameHistory
-from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames
+from cohdc_train.slam.mapping.global_bundle_adjustment import IntermediateFrames
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_mapper import LocalMapper
 from cohdc_train.slam.mapping.map import Map
@@ -57,7 +57,7 @@ class TrackerParts:
     refiner: PatchRefiner | None
     flow: FlowTracker | None
     history: FrameHistory
-    intermediate_frames: ObservedFrames | None
+    intermediate_frames: IntermediateFrames | None
 
 
 class Tracker:
@@ -199,7 +199,7 @@ class Tracker:
         last = self.state.last
         if self.parts.dynamic_mask is None or last is None or prediction is None:
             return mask
-        around = self.map.covisible(last.matches.points, self._config.local_keyframes)
+        around = self.map.covisible(last.matches.point_ids, self._config.local_keyframes)
         T_cw = prediction.prior.T_cw
         return self.parts.dynamic_mask.estimate(mask, frame.depth, T_cw, around, frame.timestamp)
 
@@ -255,9 +255,9 @@ class Tracker:
         """Insert the frame into the map, and return its estimate there."""
         features, mask = estimate.features, estimate.frame_features.dynamic_mask
         point_ids = np.full(len(features), -1)
-        point_ids[estimate.matches.keypoints] = estimate.matches.points
+        point_ids[estimate.matches.keypoints] = estimate.matches.point_ids
         keyframe = Keyframe(
-            self.map.joined,
+            self.map.num_inserted,
             frame.timestamp,
             estimate.T_cw,
             features,

@@ -41,7 +41,7 @@ class PointColorRecorder:
         if result.is_keyframe and result.features is not None:
             columns, rows = np.rint(result.features.pixels).astype(np.int64).T
             self._colors[frame.timestamp] = frame.rgb[rows, columns]
-            in_map = {keyframe.t for keyframe in point_map.keyframes}
+            in_map = {keyframe.timestamp for keyframe in point_map.keyframes}
             self._colors = {t: colors for t, colors in self._colors.items() if t in in_map}
 
     def cloud(self, point_map: Map) -> PointCloud:
@@ -53,7 +53,7 @@ class PointColorRecorder:
         colors = np.zeros((size, 3), dtype=np.uint8)
         for keyframe in point_map.keyframes:
             keypoints = np.flatnonzero(keyframe.point_ids >= 0)
-            colors[keyframe.point_ids[keypoints]] = self._colors[keyframe.t][keypoints]
+            colors[keyframe.point_ids[keypoints]] = self._colors[keyframe.timestamp][keypoints]
         needed = max(1, min(self._min_observations, len(point_map.keyframes)))
         is_confirmed = point_map.num_observations[:size] >= needed
         return PointCloud(point_map.positions[:size][is_confirmed], colors[is_confirmed])

@@ -159,5 +159,5 @@ class RerunViewer:
         cloud = self._colors.cloud(point_map)
         points = rerun.Points3D(cloud.points, colors=cloud.colors, radii=_POINT_RADIUS_M)
         log("world/points", points)
-        path = point_map.way()[:, :3, 3]
+        path = point_map.keyframe_trajectory()[:, :3, 3]
         log("world/trajectory", rerun.LineStrips3D([path], colors=[_PATH_COLOR]))

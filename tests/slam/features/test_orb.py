@@ -114,5 +114,5 @@ def test_mutually_nearest_descriptors_are_those_of_a_search_through_all() -> Non
     bits = hamming(there[:, None], here)
     nearest = (bits == bits.min(axis=0)) & (bits == bits.min(axis=1, keepdims=True)) & (bits <= 60)
     pairs = {(100 + i, j) for i, j in np.argwhere(nearest).tolist()}
-    assert set(zip(matches.points.tolist(), matches.keypoints.tolist(), strict=True)) == pairs
+    assert set(zip(matches.point_ids.tolist(), matches.keypoints.tolist(), strict=True)) == pairs
     assert len(pairs) == 25

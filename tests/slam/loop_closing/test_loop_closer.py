@@ -98,8 +98,8 @@ def test_tracking_continues_on_the_corrected_map(drifting: Run, closed: Run) -> 
 def test_both_sides_of_a_loop_share_points(closed: Run) -> None:
     point_map = closed[0].map
     newest = point_map.keyframes[-1]
-    assert point_map.shared(newest.seen_points(), point_map.keyframes[:6]).max() > 30
-    observed = [keyframe.seen_points() for keyframe in point_map.keyframes]
+    assert point_map.shared(newest.observed_point_ids(), point_map.keyframes[:6]).max() > 30
+    observed = [keyframe.observed_point_ids() for keyframe in point_map.keyframes]
     assert all(len(ids) == len(np.unique(ids)) for ids in observed), "each point once per keyframe"
     counts = np.bincount(np.concatenate(observed), minlength=point_map.size)
     np.testing.assert_array_equal(point_map.num_observations[: point_map.size], counts)
@@ -217,4 +217,4 @@ class TestVerification:
 
 def frame_number(keyframe: Keyframe) -> int:
     """Return the number of the frame that a keyframe was made of."""
-    return round(30 * keyframe.t)
+    return round(30 * keyframe.timestamp)

@@ -13,9 +13,9 @@ from cohdc_train.slam.config import BundleAdjustmentConfig, MotionModelConfig
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, to_local
 from cohdc_train.slam.mapping import global_bundle_adjustment as final_adjustment
-from cohdc_train.slam.mapping.global_bundle_adjustment import ObservedFrames, adjust_everything
+from cohdc_train.slam.mapping.global_bundle_adjustment import IntermediateFrames, adjust_everything
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
-from cohdc_train.slam.mapping.local_bundle_adjustment import Sighting
+from cohdc_train.slam.mapping.local_bundle_adjustment import FrameObservations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 from cohdc_train.slam.system import Slam
@@ -56,7 +56,7 @@ def off_after_adjustment(seed: int, frames_count: bool) -> float:
         if index == 0:
             world.add_points(keyframe, ids)
     sightings = [
-        Sighting(inverse(T_wc), ids, observations(measured(T_wc, points, rng), ids))
+        FrameObservations(inverse(T_wc), ids, observations(measured(T_wc, points, rng), ids))
         for T_wc in PATH
         if frames_count
     ]
@@ -70,9 +70,9 @@ def test_frames_between_keyframes_make_the_map_better() -> None:
         assert off_after_adjustment(seed, True) < 0.5 * off_after_adjustment(seed, False)
 
 
-def observed_frames(max_frames: int = 256) -> ObservedFrames:
+def observed_frames(max_frames: int = 256) -> IntermediateFrames:
     """A store of so many frames."""
-    return ObservedFrames(BundleAdjustmentConfig(max_frames=max_frames), MIN_POINTS)
+    return IntermediateFrames(BundleAdjustmentConfig(max_frames=max_frames), MIN_POINTS)
 
 
 def run(**options: object) -> Slam:
@@ -88,7 +88,7 @@ def slam() -> Slam:
     return run()
 
 
-def remember(seen: ObservedFrames, row: int, slam: Slam) -> None:
+def remember(seen: IntermediateFrames, row: int, slam: Slam) -> None:
     """The slam's latest frame, as one in that row of the log."""
     last = slam.tracker.state.last
     assert last is not None
@@ -125,7 +125,7 @@ def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(
         world: Map,
         reprojection: ReprojectionModel,
         config: BundleAdjustmentConfig,
-        sightings: Sequence[Sighting] = (),
+        sightings: Sequence[FrameObservations] = (),
     ) -> NDArray[np.float64]:
         if not sightings:
             world.move(np.stack([k.T_cw for k in world.keyframes]) @ inverse(exp_se3(step)))
@@ -135,7 +135,8 @@ def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(
     monkeypatch.setattr(final_adjustment, "adjust_everything", moves)
     before = slam.tracker.parts.history.poses(slam.map)
     keyframes = np.isin(
-        slam.tracker.parts.history.stamps, [keyframe.t for keyframe in slam.map.keyframes]
+        slam.tracker.parts.history.timestamps,
+        [keyframe.timestamp for keyframe in slam.map.keyframes],
     )
     slam.finish()
     wanted = before @ inverse(exp_se3(step))
@@ -149,7 +150,7 @@ def test_frames_move_when_they_are_kept_and_stay_with_their_keyframes_when_not(
 def test_frames_give_all_their_points_between_them(slam: Slam, frames: int) -> None:
     """Each only half of them; of many, those that are left do so too."""
     assert slam.tracker.state.last is not None
-    points, seen = slam.tracker.state.last.matches.points, observed_frames(max_frames=20)
+    points, seen = slam.tracker.state.last.matches.point_ids, observed_frames(max_frames=20)
     for row in range(frames):
         remember(seen, row, slam)
     for kept in seen._kept:
@@ -177,7 +178,7 @@ def test_a_row_that_a_younger_point_has_taken_says_nothing(slam: Slam) -> None:
     taken = ids[:5]
     before = slam.map.first_keyframe[taken].copy()
     slam.map.first_keyframe[taken] += 1
-    sighting = final_adjustment._sighting(seen._kept[0], np.eye(4), slam.map)
+    sighting = final_adjustment._frame_observations(seen._kept[0], np.eye(4), slam.map)
     slam.map.first_keyframe[taken] = before
     assert set(sighting.ids.tolist()) == set(ids[5:].tolist())
     assert len(sighting.seen) == len(sighting.ids)
@@ -200,7 +201,7 @@ def test_without_frames_the_keyframes_are_adjusted_once(monkeypatch: pytest.Monk
         world: object,
         reprojection: object,
         config: object,
-        sightings: Sequence[Sighting] = (),
+        sightings: Sequence[FrameObservations] = (),
     ) -> NDArray[np.float64]:
         asked.append(len(sightings))
         return np.zeros((0, 4, 4))

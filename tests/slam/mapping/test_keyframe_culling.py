@@ -15,8 +15,8 @@ from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
 from cohdc_train.slam.mapping.local_bundle_adjustment import (
     Solution,
-    close_window,
-    open_window,
+    apply_solution,
+    build_window,
 )
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.patch_refiner import affine
@@ -69,7 +69,7 @@ def whole(never_culled: Slam, monkeypatch: pytest.MonkeyPatch) -> Slam:
 
 
 def test_the_map_of_a_known_room_stops_growing(culled: Slam, never_culled: Slam) -> None:
-    assert len(never_culled.map.keyframes) == never_culled.map.joined >= ROUNDS * ROUND / 2
+    assert len(never_culled.map.keyframes) == never_culled.map.num_inserted >= ROUNDS * ROUND / 2
     assert len(culled.map.keyframes) < 0.6 * len(never_culled.map.keyframes)
     assert len(culled.map.keyframes) <= len(sway(ROUNDS - 2).map.keyframes) + 2
     assert ate(culled) < max(1.2 * ate(never_culled), 0.004)
@@ -81,7 +81,7 @@ def test_patches_are_bounded_with_the_points() -> None:
     """
     slam = sway(2)
     assert slam.tracker.parts.refiner is not None
-    assert slam.map.joined > len(slam.map.keyframes)
+    assert slam.map.num_inserted > len(slam.map.keyframes)
     assert len(slam.tracker.parts.refiner._patches) == len(slam.map.positions)
     assert len(slam.trajectory()) == 2 * ROUND
 
@@ -123,8 +123,8 @@ def ate(slam: Slam) -> float:
 
 def test_the_books_are_right_after_many_removals(culled: Slam) -> None:
     world = culled.map
-    assert world.joined > len(world.keyframes)
-    seen = [keyframe.seen_points() for keyframe in world.keyframes]
+    assert world.num_inserted > len(world.keyframes)
+    seen = [keyframe.observed_point_ids() for keyframe in world.keyframes]
     counts = np.bincount(np.concatenate(seen), minlength=world.size)
     np.testing.assert_array_equal(world.num_observations[: world.size], counts)
     there = {keyframe.index for keyframe in world.keyframes}
@@ -164,7 +164,7 @@ def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Slam) -> No
 def test_some_keyframes_never_go(whole: Slam) -> None:
     world = whole.map
     newest = world.keyframes[-1]
-    window = {keyframe.index for keyframe in world.covisible(newest.seen_points(), WINDOW)}
+    window = {keyframe.index for keyframe in world.covisible(newest.observed_point_ids(), WINDOW)}
     redundant = [
         keyframe.index
         for keyframe in cull_keyframes(deepcopy(world), newest, set(), CULLING, WINDOW)
@@ -179,23 +179,31 @@ def test_some_keyframes_never_go(whole: Slam) -> None:
 def test_a_window_under_way_moves_no_point_that_took_a_row_meanwhile(whole: Slam) -> None:
     world = whole.map
     newest, features = world.keyframes[-1], world.keyframes[-1].features
-    window = open_window(world, newest, ADJUSTMENT)
+    window = build_window(world, newest, ADJUSTMENT)
     gone = window.ids[:30]
     for keyframe in world.keyframes:
         world.forget(keyframe, np.flatnonzero(np.isin(keyframe.point_ids, gone)))
     later = keyframe_like(world, newest)
     world.add_keyframe(later)
     world.add_points(later, np.flatnonzero(features.depths > 0)[:20])
-    assert set(later.seen_points()) & set(gone.tolist())
-    before: Array = world.positions[later.seen_points()].copy()
+    assert set(later.observed_point_ids()) & set(gone.tolist())
+    before: Array = world.positions[later.observed_point_ids()].copy()
     good = np.ones(len(window.keypoints), dtype=np.bool_)
-    close_window(world, window, Solution(np.stack(window.poses), window.points + 0.5, good))
-    np.testing.assert_allclose(world.positions[later.seen_points()], before, atol=1e-9)
+    apply_solution(world, window, Solution(np.stack(window.poses), window.points + 0.5, good))
+    np.testing.assert_allclose(world.positions[later.observed_point_ids()], before, atol=1e-9)
 
 
 def keyframe_like(world: Map, keyframe: Keyframe) -> Keyframe:
     """A new one at the same place that sees no point yet."""
-    free, pictures = np.full(len(keyframe.features), -1), (keyframe.thumbnail, keyframe.nearest)
+    free, pictures = (
+        np.full(len(keyframe.features), -1),
+        (keyframe.thumbnail, keyframe.min_depth_grid),
+    )
     return Keyframe(
-        world.joined, keyframe.t + 1, keyframe.T_cw.copy(), keyframe.features, free, *pictures
+        world.num_inserted,
+        keyframe.timestamp + 1,
+        keyframe.T_cw.copy(),
+        keyframe.features,
+        free,
+        *pictures,
     )

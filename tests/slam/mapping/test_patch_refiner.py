@@ -13,7 +13,7 @@ from cohdc_train.slam.config import FeatureConfig, RefinementConfig
 from cohdc_train.slam.features.keypoints import ScalePyramid
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.features.orb import OrbExtractor, gray_of
-from cohdc_train.slam.features.patch_alignment import Pyramid, align, warped
+from cohdc_train.slam.features.patch_alignment import Pyramid, align, warp_patches
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, to_local
 from cohdc_train.slam.mapping.keyframe import observations
 from cohdc_train.slam.mapping.patch_refiner import PatchRefiner, affine
@@ -67,10 +67,10 @@ def test_a_patch_is_turned_and_scaled() -> None:
     ramp = np.broadcast_to(np.arange(16, dtype=np.uint8) * 10, (1, 16, 16))
     quarter = np.array([[[0.0, -1.0], [1.0, 0.0]]])  # x of the patch is minus y of the image
     np.testing.assert_allclose(
-        warped(ramp, quarter, 8)[0, :, 0], np.arange(110, 30, -10), atol=1e-3
+        warp_patches(ramp, quarter, 8)[0, :, 0], np.arange(110, 30, -10), atol=1e-3
     )
     np.testing.assert_allclose(
-        warped(ramp, 0.5 * np.eye(2)[None], 8)[0, 0], 75 + 5 * (np.arange(8) - 3.5), atol=1e-3
+        warp_patches(ramp, 0.5 * np.eye(2)[None], 8)[0, 0], 75 + 5 * (np.arange(8) - 3.5), atol=1e-3
     )
 
 
@@ -118,11 +118,11 @@ def test_what_a_rolling_shutter_moved_stays_moved(slam: Slam) -> None:
     aside = replace(features, pixels=features.pixels + 0.4)
     refined = [
         refiner.refine(
-            replace(aside, points=aside.points + shift), matches, keyframe.T_cw, pyramid
-        ).points
+            replace(aside, undistorted=aside.undistorted + shift), matches, keyframe.T_cw, pyramid
+        ).undistorted
         for shift in (0.0, 3.0)
     ]
-    assert (refined[0] != keyframe.features.points).any()
+    assert (refined[0] != keyframe.features.undistorted).any()
     np.testing.assert_allclose(refined[1] - refined[0], 3.0)
 
 
@@ -193,7 +193,9 @@ def test_a_map_of_refined_measurements_fits_better() -> None:
             ]
             local = to_local(keyframe.T_cw, slam.map.positions[keyframe.point_ids[keypoints]])
             errors.append(
-                np.linalg.norm(CAMERA.project(local) - keyframe.features.points[keypoints], axis=1)
+                np.linalg.norm(
+                    CAMERA.project(local) - keyframe.features.undistorted[keypoints], axis=1
+                )
             )
         left.append(np.median(np.concatenate(errors)))
     assert left[1] < 0.8 * left[0]

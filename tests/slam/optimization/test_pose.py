@@ -192,7 +192,10 @@ def test_schur_bundle_adjustment_equals_a_general_solver() -> None:
 def test_bundle_adjustment_tells_outliers_and_leaves_fixed_poses() -> None:
     true_poses, _, poses, points, problem = small_problem(5, outliers=6)
     new_poses, new_points = adjust(poses, points, problem, REPROJECTION, steps=20)
-    good = measurement_chi2(new_poses, new_points, problem, REPROJECTION) <= problem.seen.limits
+    good = (
+        measurement_chi2(new_poses, new_points, problem, REPROJECTION)
+        <= problem.seen.chi2_thresholds
+    )
     assert not good[:6].any()
     assert good[6:].all()
     new_poses, _ = adjust(

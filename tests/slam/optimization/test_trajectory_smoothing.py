@@ -118,7 +118,7 @@ def test_what_was_expected_is_taken_out_again() -> None:
     prior = Prior(expected, information[15])
     drawn, pulls = measured.copy(), np.zeros((30, 6))
     drawn[15] = exp_se3(0.5 * log_se3(expected @ inverse(measured[15]))) @ measured[15]
-    pulls[15] = prior.pull(drawn[15])
+    pulls[15] = prior.gradient(drawn[15])
     seen = alone(stamps, measured, information)
     taken_out = np.abs(smoothed(stamps, drawn, information, pulls) - seen).max()
     assert taken_out < 3e-4

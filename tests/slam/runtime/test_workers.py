@@ -23,7 +23,7 @@ from cohdc_train.slam.config import BundleAdjustmentConfig, SlamConfig
 from cohdc_train.slam.dynamics.mask_propagation import PropagatedMask, downsample_mask
 from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.se3 import exp_se3, to_local
-from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, close_window, open_window
+from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, apply_solution, build_window
 from cohdc_train.slam.runtime.async_masks import AsyncSegmenter
 from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.system import Slam
@@ -183,10 +183,10 @@ def test_keyframe_inserted_during_an_adjustment_moves_along() -> None:
     assert features is not None
     world = slam.map
     newest = world.keyframes[-1]
-    window = open_window(world, newest, BundleAdjustmentConfig())
+    window = build_window(world, newest, BundleAdjustmentConfig())
     later = replace(
         newest,
-        index=world.joined,
+        index=world.num_inserted,
         T_cw=exp_se3(np.array([0.1, 0, 0, 0, 0.1, 0])) @ newest.T_cw,
         features=features,
         point_ids=np.full(len(features), -1),
@@ -195,13 +195,13 @@ def test_keyframe_inserted_during_an_adjustment_moves_along() -> None:
     world.add_points(later, np.flatnonzero(features.depths > 0)[:20])
     step = exp_se3(np.array([0.02, -0.01, 0.03, 0.01, 0.02, 0.005]))
     between = later.T_cw @ np.linalg.inv(newest.T_cw)
-    added = later.seen_points()
+    added = later.observed_point_ids()
     assert len(added) == 20
     seen = to_local(later.T_cw, world.positions[added])
     good = np.ones(len(window.keypoints), dtype=np.bool_)
     good[-30:] = False
     before = np.count_nonzero(newest.point_ids >= 0)
-    motion = close_window(
+    motion = apply_solution(
         world, window, Solution(step @ np.stack(window.poses), window.points + 0.01, good)
     )
     assert motion is not None
@@ -210,7 +210,7 @@ def test_keyframe_inserted_during_an_adjustment_moves_along() -> None:
     np.testing.assert_allclose(to_local(later.T_cw, world.positions[added]), seen, atol=1e-9)
     assert np.count_nonzero(newest.point_ids >= 0) == before - 30, "outliers are removed"
     assert (
-        close_window(world, window, Solution(np.stack(window.poses), window.points, good)) is None
+        apply_solution(world, window, Solution(np.stack(window.poses), window.points, good)) is None
     ), "a solution for poses that have moved since is not applied"
     np.testing.assert_allclose(newest.T_cw, step @ window.poses[-1])
 

@@ -291,9 +291,9 @@ def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
     estimate, _ = flow.estimate_pose(tracks, FrameFeatures(features, None), state, STILL)
     assert estimate is not None
     np.testing.assert_allclose(estimate.T_cw, np.eye(4), atol=1e-4)
-    shifted = features.points.copy()
+    shifted = features.undistorted.copy()
     shifted[: len(shifted) // 2, 0] += 30
-    moved = FrameFeatures(replace(features, points=shifted), None)
+    moved = FrameFeatures(replace(features, undistorted=shifted), None)
     assert flow.estimate_pose(tracks, moved, state, STILL)[0] is None
 
 
@@ -359,7 +359,7 @@ def test_few_points_are_weighed_against_what_was_expected(views: list[View]) -> 
     again, started = flow.track_points(views[0][0], None, started, np.eye(4))
     steady = Prediction(Prior(np.eye(4), 1e12 * np.eye(6)), True, 150)
     seen = measure(again.keypoints, views[0][1])
-    moved = FrameFeatures(replace(seen, points=seen.points + 0.5), None)
+    moved = FrameFeatures(replace(seen, undistorted=seen.undistorted + 0.5), None)
     weighed, _ = flow.estimate_pose(again, moved, started, steady)
     alone, _ = flow.estimate_pose(again, moved, started, STILL)
     assert weighed is not None

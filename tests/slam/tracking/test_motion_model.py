@@ -204,7 +204,7 @@ def test_the_pull_is_the_gradient_of_the_squared_distance() -> None:
     step = 1e-6
     numeric = [(half_square(step * e) - half_square(-step * e)) / (2 * step) for e in np.eye(6)]
     np.testing.assert_allclose(
-        prior.pull(T_cw), numeric, rtol=0.01, atol=0.01 * np.abs(numeric).max()
+        prior.gradient(T_cw), numeric, rtol=0.01, atol=0.01 * np.abs(numeric).max()
     )
 
 

@@ -61,7 +61,7 @@ def test_inliers_are_counted_beside_matches(views: list[View]) -> None:
     assert last is not None
     points, seen = slam.map.measured(last.matches, last.features)
     chi2 = chi_square(last.T_cw, points, seen, ReprojectionModel(CAMERA))
-    assert extracted.num_inliers == np.count_nonzero(chi2 <= seen.limits)
+    assert extracted.num_inliers == np.count_nonzero(chi2 <= seen.chi2_thresholds)
 
 
 def test_same_seed_same_bits(views: list[View]) -> None:
@@ -194,7 +194,7 @@ def test_a_pose_that_is_rejected_judges_no_point(
 
     monkeypatch.setattr("cohdc_train.slam.tracking.localizer.estimate_static_pose", wrong)
     assert not track(slam, *views[2][:2], 2 / 30).is_tracked
-    np.testing.assert_array_equal(slam.map.moved, 0)
+    np.testing.assert_array_equal(slam.map.moving_log_odds, 0)
 
 
 def test_result_of_a_frame_does_not_change_when_the_map_does(views: list[View]) -> None:
@@ -261,7 +261,7 @@ def test_matching_by_projection(
         np.array([77]), np.array([[50.0, 40.0]]), np.array([0]), np.zeros((1, 4), dtype=np.uint64)
     )
     matches = match_projected(projected, features, 5.0, MatchingConfig())
-    assert matches.points.tolist() == ([77] if found else [])
+    assert matches.point_ids.tolist() == ([77] if found else [])
 
 
 def test_matches_are_one_to_one_and_clear() -> None:
