@@ -3,9 +3,10 @@ costs nothing.
 """
 
 import importlib
+import inspect
 import sys
 from collections.abc import Container, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_origin
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 
@@ -53,9 +54,7 @@ VERBS = {
     "evaluate": Verb(
         "trajectory.evaluate", "evaluate", "ATE and RPE of a trajectory against ground truth"
     ),
-    "report": Verb(
-        "report", "report", "one HTML page of a SLAM run: scores, trajectory, times, pictures"
-    ),
+    "report": Verb("report", "report", "one HTML page of a run, or of several beside each other"),
     "env": Verb("env", "env", "versions of everything that matters, and what is wrong with them"),
 }
 
@@ -132,6 +131,16 @@ def _spelled_out(args: Sequence[str], switches: Container[str]) -> list[str]:
     return spelled
 
 
+def _positional_lists(function: Any) -> dict[str, Any]:
+    """Return name -> type of an item, of parameters that are lists without a default."""
+    parameters = inspect.signature(function).parameters.values()
+    return {
+        parameter.name: get_args(parameter.annotation)[0]
+        for parameter in parameters
+        if get_origin(parameter.annotation) is list and parameter.default is parameter.empty
+    }
+
+
 def _run_function(component: Any, args: list[str], prog: str) -> None:
     """Run a typed function, or the group of them in a dict, with a command line read from its
     signature.
@@ -139,6 +148,7 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
     switches: set[str] = set()
+    lists = {} if isinstance(component, dict) else _positional_lists(component)
 
     class Parser(ArgumentParser):
         """A parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`.
@@ -148,6 +158,10 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
         """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
+            if names[0] in lists:  # RUN [RUN ...] instead of a list in brackets
+                metavar = names[0].removesuffix("s").upper()
+                kwargs = {"type": lists[names[0]], "nargs": "+", "help": kwargs["help"]}
+                kwargs["metavar"] = metavar
             if kwargs.get("type") is bool and names[0].startswith("--") and "." not in names[0]:
                 switches.add(names[0])
                 del kwargs["type"]

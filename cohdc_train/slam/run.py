@@ -25,6 +25,7 @@ from cohdc_train.slam.runtime.workers import workers
 from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import Viewer
+from cohdc_train.slam.visualization.worst_frames import WorstFrames
 from cohdc_train.trajectory.trajectory import Trajectory, read_tum
 
 
@@ -150,7 +151,8 @@ def run_source(
             in_time = (beside.executor, beside.source.spent) if beside else ()
             tracker = Tracker(source.camera, features, seed, method, *in_time)
             files = stack.enter_context(MapFiles(source.camera, part, cloud))
-            observers = [files, *observers]
+            worst = WorstFrames()
+            observers = [files, worst, *observers]
             if view or rrd is not None:
                 observers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
             stack.enter_context(stopped_by_ctrl_c(source))
@@ -160,6 +162,7 @@ def run_source(
             answer = beside.answering(on_pose) if beside else on_pose
             records = play(tracker, views, mask_of, part / "pictures", observers, answer)
             files.write(tracker)
+            worst.write(part / "pictures")
         trajectory = Trajectory(*tracker.trajectory())
         metrics = {
             "seed": seed,

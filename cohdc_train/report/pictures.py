@@ -1,0 +1,68 @@
+"""Images of a page: read, made as small as the page's size asks for, and embedded."""
+
+import base64
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.errors import DataError
+from cohdc_train.report.page import Picture
+
+PAGE_BYTES = 5_000_000
+IMAGES_BYTES = 2_600_000  # of a page, before base64 makes four bytes of three
+_LARGEST = 400_000  # bytes of one image
+_STEPS = ((1600, 88), (1600, 78), (1280, 78), (960, 75), (640, 72), (480, 65), (320, 60))
+
+
+def embed(file: Path, images: int) -> Picture:
+    """Return an image file as a picture of a page.
+
+    images: how many the page has, which share `IMAGES_BYTES`. Raises DataError for a file that is
+    no image.
+    """
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error}") from error
+    array = np.frombuffer(content, np.uint8)
+    image = cv2.imdecode(array, cv2.IMREAD_COLOR) if len(array) else None
+    if image is None:
+        raise DataError(f"{file}: cannot be read as an image")
+    limit = min(_LARGEST, IMAGES_BYTES // max(1, images))
+    height, width = image.shape[:2]
+    kind = _kind(content)
+    if kind and len(content) <= limit and max(height, width) <= _STEPS[0][0]:
+        return Picture(_url(content, kind), width, height)
+    return _smaller(image, limit)
+
+
+def embed_image(image: NDArray[np.uint8], images: int) -> Picture:
+    """Return an image, [H, W, 3] BGR, as a picture of a page that has so many."""
+    return _smaller(image, min(_LARGEST, IMAGES_BYTES // max(1, images)))
+
+
+def _smaller(image: NDArray[np.uint8], limit: int) -> Picture:
+    """Return an image as the best JPEG that is not larger than a limit, or the smallest there is."""
+    content, size = b"", (0, 0)
+    for longest, quality in _STEPS:
+        height, width = image.shape[:2]
+        scale = min(1.0, longest / max(height, width))
+        size = max(1, round(scale * width)), max(1, round(scale * height))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1 else image
+        content = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(content) <= limit:
+            break
+    return Picture(_url(content, "image/jpeg"), *size)
+
+
+def _kind(content: bytes) -> str:
+    """Return the media type of an image that every browser shows; empty for another."""
+    if content.startswith(b"\x89PNG"):
+        return "image/png"
+    return "image/jpeg" if content.startswith(b"\xff\xd8") else ""
+
+
+def _url(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -1,0 +1,238 @@
+"""SLAM runs drawn: paths with equal axes, errors on one scale, and a strip with every frame."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.report.slam_run import Floats, Frames, SlamRun
+from cohdc_train.report.svg import INK, LOST, SERIES, TRUTH, Draw, color, dash, legend
+from cohdc_train.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+View = tuple[str, int, int, float]  # title, axis to the right, axis upwards and its sign
+
+# Against ground truth z is up; without it the world is the first camera: y down, z forward.
+TRUTH_VIEWS: Sequence[View] = (("From above", 0, 1, 1), ("From the side", 0, 2, 1))
+CAMERA_VIEWS: Sequence[View] = (("From above", 0, 2, 1), ("From behind", 0, 1, -1))
+_BINS = 700  # columns of a strip: more are not seen
+_SEGMENTS = 250  # pieces of a path with a color of their own
+_LOG_FROM = 8.0  # ratio of two runs' errors from which the axis is logarithmic
+_SHADES = (0.08, 0.9)  # part of the color map that is seen on white and on black
+
+
+def draw_paths(view: View, truth: Trajectory | None, runs: Sequence[tuple[int, SlamRun]]) -> Draw:
+    """Return a drawing of the positions of runs, m, seen along one axis, with equal axes.
+
+    runs: with their places in the list, which give their colors.
+    """
+
+    def draw(figure: "Figure") -> None:
+        axes = figure.subplots()
+        _, i, j, sign = view
+        if truth is not None:
+            points = truth.positions
+            axes.plot(
+                points[:, i],
+                sign * points[:, j],
+                color=TRUTH,
+                lw=2.4,
+                alpha=0.35,
+                label="ground truth",
+            )
+        for place, run in runs:
+            points = run.path()[1]
+            axes.plot(
+                points[:, i], sign * points[:, j], dash(place), color=color(place), label=run.label
+            )
+        _equal(axes, view)
+        legend(figure, axes)
+
+    return draw
+
+
+def draw_error_path(view: View, run: SlamRun, largest: float) -> Draw:
+    """Return a drawing of one run's path, colored by its distance to the ground truth.
+
+    largest: error at the end of the color scale, m, the same for every run of a page.
+    """
+
+    def draw(figure: "Figure") -> None:
+        from matplotlib import colormaps
+        from matplotlib.collections import LineCollection
+        from matplotlib.colors import ListedColormap
+
+        axes = figure.subplots()
+        _, i, j, sign = view
+        errors = run.errors()
+        if errors is None or run.matched is None:
+            return
+        gaps = run.gaps(run.matched.stamps)
+        points = np.insert(run.matched.positions, gaps, np.nan, axis=0)[:, [i, j]] * (1, sign)
+        pieces, values = _pieces(points, errors[1])
+        shades = ListedColormap(colormaps["turbo"](np.linspace(*_SHADES, 256)))
+        lines = LineCollection(pieces, cmap=shades, clim=(0, largest), linewidths=2.2)
+        lines.set_array(values)
+        lines.set_capstyle("round")
+        axes.add_collection(lines)
+        axes.autoscale_view()
+        _equal(axes, view)
+        bar = figure.colorbar(lines, ax=axes, location="bottom", shrink=0.8, aspect=40, pad=0.02)
+        bar.set_label("distance to the ground truth, m")
+        bar.outline.set_visible(False)  # type: ignore[operator]
+
+    return draw
+
+
+def draw_errors(runs: Sequence[tuple[int, SlamRun]]) -> Draw:
+    """Return a drawing of the distance to the ground truth over time, all runs on one scale."""
+
+    def draw(figure: "Figure") -> None:
+        axes = figure.subplots()
+        typical = []
+        for place, run in runs:
+            errors = run.errors()
+            if errors is not None:
+                stamps, distances = errors
+                typical.append(float(np.nanmedian(distances)))
+                times = stamps - run.start
+                axes.plot(times, distances, dash(place), color=color(place), label=run.label)
+        if typical and max(typical) > _LOG_FROM * max(min(typical), 1e-6):
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0)
+        axes.set(xlabel="time, s", ylabel="distance to the ground truth, m")
+        axes.margins(x=0.01)
+        legend(figure, axes)
+
+    return draw
+
+
+def draw_strip(run: SlamRun, letters: dict[int, str], tops: dict[str, float]) -> Draw:
+    """Return a drawing of every frame: inliers, masked share, times; lost frames are red.
+
+    letters: index of a frame -> the letter below which its image is shown; tops: row -> upper end
+    of its axis, so that runs can be compared.
+    """
+    frames = run.frames
+    assert frames is not None
+
+    def draw(figure: "Figure") -> None:
+        rows: list[tuple[str, Callable[[Axes, Frames, Floats], None]]] = [
+            ("inliers", _draw_inliers)
+        ]
+        if frames.columns["culled_share"].any():
+            rows.append(("masked, %", _draw_masked))
+        rows.append(("time, ms", _draw_times))
+        heights = [1.3, *[1.0] * (len(rows) - 1)]
+        panels = np.ravel(figure.subplots(len(rows), 1, sharex=True, height_ratios=heights))
+        times = frames.stamps - run.start
+        for (name, draw_row), axes in zip(rows, panels, strict=True):
+            draw_row(axes, frames, times)
+            _mark_lost(axes, frames, times)
+            axes.set(ylabel=name, ylim=(0, max(1e-6, 1.05 * tops[name])))
+            axes.grid(axis="x", visible=False)
+        _mark_frames(panels[0], times, letters, 1.05 * tops["inliers"])
+        panels[-1].set_xlabel("time, s")
+        panels[-1].set_xlim(times[0], max(times[-1], times[0] + 1e-3))
+        figure.align_ylabels(list(panels))
+
+    return draw
+
+
+def strip_tops(runs: Sequence[SlamRun]) -> dict[str, float]:
+    """Return the upper ends of a strip's axes that all runs fit in."""
+    tops = {"inliers": 1.0, "masked, %": 1.0, "time, ms": 1.0}
+    for run in runs:
+        if run.frames is not None and len(run.frames):
+            columns = run.frames.columns
+            total = sum(columns[name] for name in ("segment_ms", "track_ms", "map_ms"))
+            tops["inliers"] = max(tops["inliers"], float(columns["inliers"].max()))
+            tops["masked, %"] = max(tops["masked, %"], float(100 * columns["culled_share"].max()))
+            tops["time, ms"] = max(tops["time, ms"], float(np.quantile(total, 0.998)))
+    return tops
+
+
+def _draw_inliers(axes: "Axes", frames: Frames, times: Floats) -> None:
+    x, low = _binned(times, frames.columns["inliers"], np.minimum)
+    axes.fill_between(x, low, step="mid", color=SERIES[0], alpha=0.75, lw=0)
+    keyframes = times[frames.columns["keyframe"] > 0]
+    top = axes.get_xaxis_transform()
+    axes.plot(
+        keyframes, np.full(len(keyframes), 0.97), "|", color=INK, ms=5, mew=0.8, transform=top
+    )
+
+
+def _draw_masked(axes: "Axes", frames: Frames, times: Floats) -> None:
+    x, high = _binned(times, 100 * frames.columns["culled_share"], np.maximum)
+    axes.fill_between(x, high, step="mid", color=SERIES[3], alpha=0.75, lw=0)
+
+
+def _draw_times(axes: "Axes", frames: Frames, times: Floats) -> None:
+    below: Floats | float = 0.0
+    stages = {"segment_ms": "segmentation", "track_ms": "tracking", "map_ms": "mapping"}
+    for place, (column, name) in zip((3, 0, 4), stages.items(), strict=True):
+        if not frames.columns[column].any():
+            continue
+        x, high = _binned(times, frames.columns[column], np.maximum)
+        axes.fill_between(
+            x, below, below + high, step="mid", color=SERIES[place], alpha=0.85, lw=0, label=name
+        )
+        below = below + high
+    if len(times) > 2:
+        interval = 1e3 * float(np.median(np.diff(times)))
+        axes.axhline(
+            interval, color=INK, lw=0.9, ls=(0, (4, 3)), label=f"camera, {interval:.0f} ms"
+        )
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 0.98), ncols=4, borderpad=0, columnspacing=1.2)
+
+
+def _mark_lost(axes: "Axes", frames: Frames, times: Floats) -> None:
+    half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.01
+    for first, last in frames.lost_spans():
+        axes.axvspan(times[first] - half, times[last] + half, color=LOST, alpha=0.45, lw=0)
+
+
+def _mark_frames(axes: "Axes", times: Floats, letters: dict[int, str], top: float) -> None:
+    for index, letter in letters.items():
+        axes.annotate(
+            letter,
+            (times[index], top),
+            (0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontweight="bold",
+            fontsize=9,
+        )
+        axes.axvline(times[index], color=INK, lw=0.7, alpha=0.7)
+
+
+def _binned(times: Floats, values: Floats, combine: "np.ufunc") -> tuple[Floats, Floats]:
+    """Return at most `_BINS` times and values; a bin's value is its lowest or its highest."""
+    if len(times) <= _BINS:
+        return times, values
+    starts = np.unique(np.linspace(0, len(times), _BINS, endpoint=False).astype(int))
+    return times[starts], np.asarray(combine.reduceat(values, starts))
+
+
+def _pieces(points: Floats, values: Floats) -> tuple[list[NDArray[np.float64]], Floats]:
+    """Return at most about `_SEGMENTS` pieces of a path, none over a gap, and their mean values."""
+    step = max(1, -(-len(points) // _SEGMENTS))
+    pieces, means = [], []
+    for start in range(0, len(points) - 1, step):
+        piece, value = points[start : start + step + 1], values[start : start + step + 1]
+        if np.isfinite(value).any():
+            pieces.append(piece)
+            means.append(float(np.nanmean(value)))
+    return pieces, np.array(means)
+
+
+def _equal(axes: "Axes", view: View) -> None:
+    title, i, j, sign = view
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel=f"{'xyz'[i]}, m", ylabel=f"{'−' if sign < 0 else ''}{'xyz'[j]}, m")
+    axes.margins(0.06)
