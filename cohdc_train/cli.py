@@ -2,21 +2,27 @@
 costs nothing.
 """
 
+import functools
 import importlib
 import inspect
 import sys
 from collections.abc import Container, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_origin
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 
 
 class Verb(NamedTuple):
-    """A row of the table: where the typed function (or the group of them) behind a verb lies."""
+    """A row of the table: where the typed function (or the group of them) behind a verb lies.
+
+    has_page: whether its run ends with report.html in the folder that `--out` names.
+    """
 
     module: str
     attribute: str
     summary: str
+    has_page: bool = False
 
 
 VERBS = {
@@ -33,7 +39,9 @@ VERBS = {
     "synth": Verb(
         "synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"
     ),
-    "fit": Verb("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),
+    "fit": Verb(
+        "train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder", True
+    ),
     "validate": Verb(
         "validation", "validate", "score a checkpoint or an ONNX on a COCO-format folder"
     ),
@@ -44,12 +52,13 @@ VERBS = {
         "prediction.predict", "predict", "run an ONNX on images: overlays and COCO JSON (no torch)"
     ),
     "bench": Verb(
-        "bench", "bench", "Table 4: networks trained, exported, scored and timed side by side"
+        "bench", "bench", "Table 4: networks trained, exported, scored and timed side by side", True
     ),
     "slam": Verb(
         "slam.run",
         "slam",
         "RGB-D sequence -> trajectory, map tracking with people removed (no torch)",
+        True,
     ),
     "evaluate": Verb(
         "trajectory.evaluate", "evaluate", "ATE and RPE of a trajectory against ground truth"
@@ -101,9 +110,11 @@ def _call(name: str, args: list[str]) -> None:
     try:
         component = getattr(importlib.import_module(f"cohdc_train.{verb.module}"), verb.attribute)
         if name == "fit":  # Lightning's own command line, which reads the arguments itself
-            component(args)
+            trainer = component(args)
+            if trainer.is_global_zero:
+                _write_page(Path(trainer.default_root_dir))
             return
-        _run_function(component, args, f"cohdc {name}")
+        _run_function(_with_page(component) if verb.has_page else component, args, f"cohdc {name}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
@@ -112,6 +123,26 @@ def _call(name: str, args: list[str]) -> None:
             f"{name} needs {package}, which is not installed: pip install 'cohdc-train[train]'"
         )
         raise MissingExtraError(message) from error
+
+
+def _with_page(function: Any) -> Any:
+    """Return a verb's function that writes the page of the folder `out` when it is done."""
+
+    @functools.wraps(function)
+    def run(**options: Any) -> Any:
+        result = function(**options)
+        _write_page(options["out"])
+        return result
+
+    return run
+
+
+def _write_page(folder: Path) -> None:
+    """Write report.html of a run. What is wrong with it is told, and does not spoil the run."""
+    try:
+        importlib.import_module("cohdc_train.report").report([folder])
+    except CohdcError as error:
+        print(f"no report: {error}", file=sys.stderr)
 
 
 def _spelled_out(args: Sequence[str], switches: Container[str]) -> list[str]:

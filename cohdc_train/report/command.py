@@ -1,6 +1,7 @@
 """`cohdc report`: folders of runs in, one HTML page out."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from cohdc_train.report.training_sections import training_page
 from cohdc_train.trajectory.trajectory import read_tum
 
 PAGE = "report.html"
+_NAMED = 3  # runs that stand in a page's title
 
 
 class Kind(Enum):
@@ -51,8 +53,8 @@ def report(
         runs: folders and files; of several the page compares those of one kind.
         groundtruth: TUM file for all SLAM runs; groundtruth.txt of a run's sequence when not given
             and there.
-        out: the HTML file; report.html in the folder of a single run, and ./report.html for several,
-            when not given.
+        out: the HTML file; when not given, report.html in the folder of a single run, and in the
+            current folder for several.
         title: of the page; the name of the folder when not given.
     """
     if not runs:
@@ -71,7 +73,8 @@ def report(
         for kind in Kind
         for made in _pages(kind, {labels[p]: p for p in kinds if kinds[p] is kind}, groundtruth)
     ]
-    default = labels[runs[0]] if len(runs) == 1 else " | ".join(labels.values())
+    names = list(labels.values())
+    default = f"{len(names)} runs" if len(names) > _NAMED else ", ".join(names)
     _write(page, _joined(title or default, pages))
     if out is None:
         list_files(folder, "report", [PAGE])
@@ -198,7 +201,7 @@ def _joined(title: str, pages: Sequence[Page]) -> Page:
 
 
 def _untitled(table: Table) -> Table:
-    return Table("", table.head, table.rows, table.best, table.note)
+    return replace(table, title="")
 
 
 def _write(out: Path, page: Page) -> None:

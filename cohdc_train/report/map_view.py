@@ -54,8 +54,9 @@ def read_points(file: Path) -> tuple[Floats, Image]:
 
 
 def scale_length(meters: float) -> float:
-    """Return the length of a scale bar, 1, 2 or 5 times a power of ten, at most a quarter of a
-    width.
+    """Return a round length for a scale bar: 1, 2 or 5 times a power of ten.
+
+    It is at most a quarter of the image's width. meters: that width.
     """
     power = 10.0 ** math.floor(math.log10(meters / 4))
     return max(step * power for step in (1, 2, 5) if step * power <= meters / 4)

@@ -22,13 +22,14 @@ class Fact:
 class Table:
     """A table of the page: a title, the words of the head and of the rows.
 
-    best: (row, column) of cells that are the best of their column; note: a sentence below. Raises
-    ValueError for an uneven row.
+    words: how many columns hold words, which stand at the left; best: (row, column) of cells that
+    are the best of their column; note: a sentence below. Raises ValueError for an uneven row.
     """
 
     title: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
+    words: int = 1
     best: frozenset[tuple[int, int]] = frozenset()
     note: str = ""
 
@@ -51,7 +52,8 @@ class Figure:
     """A plot or an image with its caption.
 
     wide, narrow: SVG elements for a screen and for a telephone, empty for an image; span: whether
-    it takes the whole width of the page.
+    it takes the whole width of the page; large: whether it takes twice the room of others;
+    chart: whether the image is a plot on white, which a dark page turns over.
     """
 
     title: str
@@ -60,6 +62,8 @@ class Figure:
     narrow: str = ""
     picture: Picture | None = None
     span: bool = False
+    large: bool = False
+    chart: bool = False
 
 
 @dataclass(frozen=True)

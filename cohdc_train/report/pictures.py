@@ -12,8 +12,17 @@ from cohdc_train.report.page import Picture
 
 PAGE_BYTES = 5_000_000
 IMAGES_BYTES = 2_600_000  # of a page, before base64 makes four bytes of three
-_LARGEST = 400_000  # bytes of one image
-_STEPS = ((1600, 88), (1600, 78), (1280, 78), (960, 75), (640, 72), (480, 65), (320, 60))
+_LARGEST = 800_000  # bytes of one image
+_STEPS = (
+    (2400, 85),
+    (2000, 82),
+    (1600, 80),
+    (1280, 78),
+    (960, 75),
+    (640, 72),
+    (480, 65),
+    (320, 60),
+)
 
 
 def embed(file: Path, images: int) -> Picture:
@@ -44,7 +53,7 @@ def embed_image(image: NDArray[np.uint8], images: int) -> Picture:
 
 
 def _smaller(image: NDArray[np.uint8], limit: int) -> Picture:
-    """Return an image as the best JPEG that is not larger than a limit, or the smallest there is."""
+    """Return an image as the best JPEG below a limit of bytes, or else as the smallest."""
     content, size = b"", (0, 0)
     for longest, quality in _STEPS:
         height, width = image.shape[:2]

@@ -82,7 +82,11 @@ def bench_page(title: str, rows: Sequence[Mapping[str, Any]]) -> Page:
     ]
     best = mark_best(cells, [0, *(BENCH[key].better for key in columns)])
     table = Table(
-        "", ["Network", *(BENCH[key].title for key in columns)], cells, best, "Bold: best."
+        "",
+        ["Network", *(BENCH[key].title for key in columns)],
+        cells,
+        best=best,
+        note="Bold: best.",
     )
     wide, narrow = (svg(_draw_bench(rows), size, f"bench{size.width}") for size in _BENCH_SIZES)
     caption = "Circle: float32, square: int8; with onnxruntime."

@@ -9,29 +9,37 @@ from cohdc_train.report.page import Fact, Table
 from cohdc_train.report.slam_run import SlamRun
 from cohdc_train.report.tables import mark_best
 
+_COMPARED = ("ate_m", "rpe_1s_m", "rpe_1s_deg")
 _SPANS = 8  # lost spans that are named one by one
 
 
 def lead(run: SlamRun) -> str:
     """Return the run in one sentence."""
     frames, tracked = _frames(run)
-    share = f"{tracked} of {count(frames, 'frame')} tracked"
     error = run.metrics.get("ate_m")
-    if tracked == 0:
+    if "frames" not in run.metrics:
+        share = f"{count(tracked, 'pose')}"
+    elif tracked == 0:
         return f"Nothing was tracked: all {count(frames, 'frame')} were lost."
+    else:
+        share = f"{tracked} of {count(frames, 'frame')} tracked"
+    way = f" over {run.length():.1f} m" if run.trajectory is not None else ""
     if error is None:
-        return f"{share}, over {run.length():.1f} m. Without ground truth there are no errors."
-    return f"{share}, over {run.length():.1f} m, with a translation error of {error['rmse']:.4f} m."
+        return f"{share}{way}. Without ground truth there are no errors."
+    return f"{share}{way}, with a translation error of {error['rmse']:.4f} m."
 
 
 def facts(run: SlamRun) -> list[Fact]:
     """Return what to know of a run first."""
     metrics = run.metrics
     frames, tracked = _frames(run)
+    share = f"{100 * metrics['coverage']:.1f} %"
     found = [
-        Fact("Frames tracked", f"{tracked} of {frames}", f"{100 * metrics['coverage']:.1f} %"),
+        Fact("Frames tracked", f"{tracked} of {frames}", share),
         _lost_fact(run, frames - tracked),
     ]
+    if "frames" not in metrics:  # of `cohdc evaluate`, which knows poses alone
+        found = [Fact("Ground truth covered", share), Fact("Poses matched", str(metrics["pairs"]))]
     if "dropped" in metrics:
         found.append(
             Fact("Frames dropped", str(metrics["dropped"]), "came while tracking was busy")
@@ -52,6 +60,12 @@ def facts(run: SlamRun) -> list[Fact]:
         pace = "at the camera's pace" if metrics.get("realtime") else "as fast as it goes"
         found.append(Fact("Speed", f"{metrics['fps']:.1f} frames/s", pace))
     return found + _settings(run)
+
+
+def common_settings(runs: Sequence[SlamRun]) -> list[Fact]:
+    """Return the facts known before a run in which all runs agree."""
+    first, *others = [_settings(run) for run in runs]
+    return [fact for fact in first if all(fact in of_run for of_run in others)]
 
 
 def _settings(run: SlamRun) -> list[Fact]:
@@ -128,17 +142,19 @@ def error_table(runs: Sequence[SlamRun]) -> list[Table]:
     """Return the six statistics of every error, a row per run and error."""
     rows = []
     for key, quantity in ERRORS.items():
+        title = quantity.title
         for run in runs:
             if key in run.metrics:
                 values = [quantity.text(run.metrics[key][name]) for name in STATISTICS]
-                rows.append([quantity.title, run.label, *values])
+                rows.append([title, run.label, *values])
+                title = ""  # once for all runs
     if not rows:
         return []
     head = ["Error", "Run", *STATISTICS.values()]
     if len(runs) == 1:
         head, rows = [head[0], *head[2:]], [[row[0], *row[2:]] for row in rows]
     note = "After rigid alignment to the ground truth, without scale. RMSE: root mean square."
-    return [Table("", head, rows, note=note)]
+    return [Table("", head, rows, words=min(2, len(runs)), note=note)]
 
 
 def time_table(runs: Sequence[SlamRun]) -> list[Table]:
@@ -154,7 +170,7 @@ def time_table(runs: Sequence[SlamRun]) -> list[Table]:
     head = ["Stage", "Run", "Median, ms", "95th percentile, ms"]
     if len(runs) == 1:
         head, rows = [head[0], *head[2:]], [[row[0], *row[2:]] for row in rows]
-    return [Table("", head, rows)]
+    return [Table("", head, rows, words=min(2, len(runs)))]
 
 
 def comparison(runs: Sequence[SlamRun]) -> Table:
@@ -163,9 +179,10 @@ def comparison(runs: Sequence[SlamRun]) -> Table:
         ("Frames tracked, %", 1, [100 * run.metrics["coverage"] for run in runs], 1),
         ("Frames lost", -1, [float(_frames(run)[0] - _frames(run)[1]) for run in runs], 0),
     ]
-    for key, quantity in ERRORS.items():
+    for key in _COMPARED:
         values = [run.metrics[key]["rmse"] if key in run.metrics else None for run in runs]
-        columns.append((f"{quantity.name} RMSE, {quantity.unit}", -1, values, quantity.digits))
+        name = f"{ERRORS[key].name}, RMSE, {ERRORS[key].unit}"
+        columns.append((name, -1, values, ERRORS[key].digits))
     columns += [
         ("Speed, frames/s", 1, [run.metrics.get("fps") for run in runs], 1),
         ("Length, m", 0, [run.length() for run in runs], 2),
@@ -180,4 +197,4 @@ def comparison(runs: Sequence[SlamRun]) -> Table:
     ]
     best = mark_best(rows, [0, *(better for _, better, _, _ in columns)])
     note = "Bold: the best of a column." if best else ""
-    return Table("", ["Run", *(name for name, *_ in columns)], rows, best, note)
+    return Table("", ["Run", *(name for name, *_ in columns)], rows, best=best, note=note)

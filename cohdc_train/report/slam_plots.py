@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.report.slam_run import Floats, Frames, SlamRun
-from cohdc_train.report.svg import INK, LOST, SERIES, TRUTH, Draw, color, dash, legend
+from cohdc_train.report.svg import INK, LOST, SERIES, TRUTH, Draw, color, dash, legend, log_scale
 from cohdc_train.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -17,8 +17,17 @@ if TYPE_CHECKING:
 View = tuple[str, int, int, float]  # title, axis to the right, axis upwards and its sign
 
 # Against ground truth z is up; without it the world is the first camera: y down, z forward.
-TRUTH_VIEWS: Sequence[View] = (("From above", 0, 1, 1), ("From the side", 0, 2, 1))
-CAMERA_VIEWS: Sequence[View] = (("From above", 0, 2, 1), ("From behind", 0, 1, -1))
+TRUTH_VIEWS: Sequence[View] = (
+    ("From above", 0, 1, 1),
+    ("From the front", 0, 2, 1),
+    ("From the side", 1, 2, 1),
+)
+CAMERA_VIEWS: Sequence[View] = (
+    ("From above", 0, 2, 1),
+    ("From behind", 0, 1, -1),
+    ("From the side", 2, 1, -1),
+)
+_DrawRow = Callable[["Axes", Frames, Floats], None]
 _BINS = 700  # columns of a strip: more are not seen
 _SEGMENTS = 250  # pieces of a path with a color of their own
 _LOG_FROM = 8.0  # ratio of two runs' errors from which the axis is logarithmic
@@ -65,6 +74,7 @@ def draw_error_path(view: View, run: SlamRun, largest: float) -> Draw:
         from matplotlib import colormaps
         from matplotlib.collections import LineCollection
         from matplotlib.colors import ListedColormap
+        from matplotlib.ticker import MaxNLocator
 
         axes = figure.subplots()
         _, i, j, sign = view
@@ -81,9 +91,11 @@ def draw_error_path(view: View, run: SlamRun, largest: float) -> Draw:
         axes.add_collection(lines)
         axes.autoscale_view()
         _equal(axes, view)
-        bar = figure.colorbar(lines, ax=axes, location="bottom", shrink=0.8, aspect=40, pad=0.02)
+        bar = figure.colorbar(
+            lines, ax=axes, location="bottom", shrink=0.8, aspect=40, pad=0.02, ticks=MaxNLocator(5)
+        )
         bar.set_label("distance to the ground truth, m")
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
 
     return draw
 
@@ -102,7 +114,7 @@ def draw_errors(runs: Sequence[tuple[int, SlamRun]]) -> Draw:
                 times = stamps - run.start
                 axes.plot(times, distances, dash(place), color=color(place), label=run.label)
         if typical and max(typical) > _LOG_FROM * max(min(typical), 1e-6):
-            axes.set_yscale("log")
+            log_scale(axes)
         else:
             axes.set_ylim(bottom=0)
         axes.set(xlabel="time, s", ylabel="distance to the ground truth, m")
@@ -119,19 +131,18 @@ def draw_strip(run: SlamRun, letters: dict[int, str], tops: dict[str, float]) ->
     of its axis, so that runs can be compared.
     """
     frames = run.frames
-    assert frames is not None
+    if frames is None:
+        raise ValueError(f"{run.label}: has no frames to draw")
+    times = frames.stamps - run.start
+    rows: dict[str, _DrawRow] = {"inliers": _draw_inliers}
+    if frames.columns["culled_share"].any():
+        rows["masked, %"] = _draw_masked
+    rows["time, ms"] = _draw_times
 
     def draw(figure: "Figure") -> None:
-        rows: list[tuple[str, Callable[[Axes, Frames, Floats], None]]] = [
-            ("inliers", _draw_inliers)
-        ]
-        if frames.columns["culled_share"].any():
-            rows.append(("masked, %", _draw_masked))
-        rows.append(("time, ms", _draw_times))
         heights = [1.3, *[1.0] * (len(rows) - 1)]
         panels = np.ravel(figure.subplots(len(rows), 1, sharex=True, height_ratios=heights))
-        times = frames.stamps - run.start
-        for (name, draw_row), axes in zip(rows, panels, strict=True):
+        for (name, draw_row), axes in zip(rows.items(), panels, strict=True):
             draw_row(axes, frames, times)
             _mark_lost(axes, frames, times)
             axes.set(ylabel=name, ylim=(0, max(1e-6, 1.05 * tops[name])))
@@ -232,7 +243,7 @@ def _pieces(points: Floats, values: Floats) -> tuple[list[NDArray[np.float64]], 
 
 
 def _equal(axes: "Axes", view: View) -> None:
-    title, i, j, sign = view
+    _, i, j, sign = view
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel=f"{'xyz'[i]}, m", ylabel=f"{'−' if sign < 0 else ''}{'xyz'[j]}, m")
     axes.margins(0.06)

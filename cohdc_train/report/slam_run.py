@@ -42,7 +42,7 @@ class Frames:
     @property
     def lost(self) -> NDArray[np.bool_]:
         """[n], True where the frame has no pose."""
-        return self.columns["tracked"] == 0
+        return np.asarray(self.columns["tracked"] == 0)
 
     def lost_spans(self) -> list[tuple[int, int]]:
         """Return first and last index of every run of lost frames."""
@@ -57,8 +57,8 @@ class SlamRun:
 
     metrics, config: content of metrics.json and config.yaml; frames: None without frames.csv;
     trajectory: every tracked pose, aligned to the ground truth where there is one, None where none
-    was tracked; truth, matched: poses of the same moments, None without ground truth; T: [4, 4] from
-    the run's world, which its map is in, to that of `trajectory`.
+    was tracked; truth, matched: poses of the same moments, None without ground truth; T: [4, 4]
+    from the run's world, which its map is in, to that of `trajectory`.
     """
 
     label: str
@@ -74,9 +74,14 @@ class SlamRun:
     @property
     def start(self) -> float:
         """Stamp from which the time of plots counts, s."""
+        return self.span()[0]
+
+    def span(self) -> tuple[float, float]:
+        """Return the stamps of the first and the last frame, of the poses without frames.csv, s."""
+        stamps = np.zeros(1) if self.trajectory is None else self.trajectory.stamps
         if self.frames is not None and len(self.frames):
-            return float(self.frames.stamps[0])
-        return 0.0 if self.trajectory is None else float(self.trajectory.stamps[0])
+            stamps = self.frames.stamps
+        return float(stamps[0]), float(stamps[-1])
 
     def errors(self) -> tuple[Floats, Floats] | None:
         """Return stamps [n], s, and distances to the ground truth [n], m; nan rows at gaps."""
@@ -119,7 +124,7 @@ def read_slam_run(label: str, folder: Path, truth: Trajectory | None) -> SlamRun
 
 
 def match_to_truth(run: SlamRun, trajectory: Trajectory, truth: Trajectory | None) -> SlamRun:
-    """Return a run with its trajectory, aligned to the ground truth where there is one of its time."""
+    """Return a run with its trajectory, aligned to the ground truth where their times match."""
     if truth is None:
         return replace(run, trajectory=trajectory)
     try:
@@ -172,10 +177,13 @@ def _read_frames(file: Path) -> Frames | None:
         return None
     try:
         with file.open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream))
+            reader = csv.DictReader(stream)
+            rows = list(reader)
+        if missing := {"stamp", *_COLUMNS} - set(reader.fieldnames or ()):
+            raise ValueError(f"no column {min(missing)}")
         names = [row["stamp"] for row in rows]
         stamps = np.array([float(name) for name in names])
         columns = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise DataError(f"{file}: cannot be read as a table of frames: {error!r}") from error
+        raise DataError(f"{file}: cannot be read as a table of frames: {error}") from error
     return Frames(names, stamps, columns)

@@ -12,6 +12,7 @@ from cohdc_train.report.pictures import embed, embed_image
 from cohdc_train.report.slam_plots import (
     CAMERA_VIEWS,
     TRUTH_VIEWS,
+    View,
     draw_error_path,
     draw_errors,
     draw_paths,
@@ -35,7 +36,8 @@ def slam_page(title: str, runs: Sequence[SlamRun], truth: Trajectory | None) -> 
     if len(runs) == 1:
         (run,) = runs
         return Page(title, "SLAM run", [slam_facts.lead(run)], slam_facts.facts(run), sections)
-    return Page(title, f"Comparison of {len(runs)} SLAM runs", sections=sections)
+    common = slam_facts.common_settings(runs)
+    return Page(title, f"Comparison of {len(runs)} SLAM runs", facts=common, sections=sections)
 
 
 def slam_sections(runs: Sequence[SlamRun], truth: Trajectory | None) -> list[Section]:
@@ -57,41 +59,50 @@ def slam_sections(runs: Sequence[SlamRun], truth: Trajectory | None) -> list[Sec
 def _trajectories(runs: Sequence[tuple[int, SlamRun]], truth: Trajectory | None) -> Section:
     if all(run.trajectory is None for _, run in runs):
         return Section("Trajectory")
-    aligned = truth is not None and any(run.matched is not None for _, run in runs)
-    views = TRUTH_VIEWS if aligned else CAMERA_VIEWS
-    title = "Trajectory against ground truth" if aligned else "Trajectory"
-    how = ["Rigidly aligned, equal axes; gaps are where tracking was lost."]
-    shown = [
-        (place, run) for place, run in runs if not aligned or run.matched is not None
-    ]  # what has no truth lies in another world
-    figures = [
-        Figure(
-            view[0],
-            wide=svg(draw_paths(view, truth if aligned else None, shown), _SQUARE, f"path{k}"),
-        )
-        for k, view in enumerate(views)
-    ]
-    return Section(
-        title, how if aligned else [how[0].replace("Rigidly aligned, e", "E")], figures=figures
-    )
+    shown = [(place, run) for place, run in runs if run.matched is not None]
+    if truth is None or not shown:
+        figures = [_path(k, view, None, runs) for k, view in enumerate(CAMERA_VIEWS)]
+        words = ["Meters from the first camera, equal axes; gaps are where tracking was lost."]
+        return Section("Trajectory", words, figures=figures)
+    meanwhile = _during(truth, [run for _, run in shown])
+    figures = [_path(k, view, meanwhile, shown) for k, view in enumerate(TRUTH_VIEWS)]
+    words = ["Rigidly aligned to the ground truth, equal axes; gaps are where tracking was lost."]
+    return Section("Trajectory", words, figures=figures)
+
+
+def _path(
+    number: int, view: View, truth: Trajectory | None, runs: Sequence[tuple[int, SlamRun]]
+) -> Figure:
+    return Figure(view[0], wide=svg(draw_paths(view, truth, runs), _SQUARE, f"path{number}"))
+
+
+def _during(truth: Trajectory, runs: Sequence[SlamRun]) -> Trajectory:
+    """Return the part of the ground truth in which there were frames."""
+    spans = [run.span() for run in runs]
+    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    inside = np.flatnonzero((truth.stamps >= first) & (truth.stamps <= last))
+    return truth.take(inside) if len(inside) else truth
+
+
+def _error_paths(runs: Sequence[tuple[int, SlamRun]], total: int) -> list[Figure]:
+    errors = [errors for _, run in runs if (errors := run.errors()) is not None]
+    largest = max(float(np.nanmax(distances)) for _, distances in errors)
+    figures = []
+    for place, run in runs[:_ERROR_PATHS]:
+        title = "Where the error is" if total == 1 else f"Where the error is: {run.label}"
+        caption = "From above." if total == 1 else "From above; one color scale for all runs."
+        drawing = draw_error_path(TRUTH_VIEWS[0], run, largest)
+        figures.append(Figure(title, caption, wide=svg(drawing, _SQUARE, f"error-path{place}")))
+    return figures
 
 
 def _errors(runs: Sequence[tuple[int, SlamRun]]) -> Section:
     tables = slam_facts.error_table([run for _, run in runs])
-    shown = [(place, run) for place, run in runs if run.errors() is not None]
+    shown = [(place, run) for place, run in runs if run.matched is not None]
     if not shown:
         return Section("Errors", tables=tables)
-    figures = [_two("Error over time", draw_errors(shown), _WIDE, _NARROW, "errors")]
-    largest = max(float(np.nanmax(run.errors()[1])) for _, run in shown)  # type: ignore[index]
-    for place, run in shown[:_ERROR_PATHS]:
-        name = "Where the error is" if len(runs) == 1 else run.label
-        drawing = draw_error_path(TRUTH_VIEWS[0], run, largest)
-        caption = (
-            "From above; the color scale is the same for every run."
-            if len(runs) > 1
-            else "From above."
-        )
-        figures.append(Figure(name, caption, wide=svg(drawing, _SQUARE, f"error-path{place}")))
+    over_time = _two("Error over time", draw_errors(shown), _WIDE, _NARROW, "errors")
+    figures = [over_time, *_error_paths(shown, len(runs))]
     return Section("Errors", tables=tables, figures=figures)
 
 
@@ -104,7 +115,7 @@ def _strips(runs: Sequence[tuple[int, SlamRun]]) -> list[Section]:
             continue
         worst = _worst_frames(run, _WORST.get(len(runs), 2))
         letters = {index: chr(ord("A") + k) for k, (index, _) in enumerate(worst)}
-        caption = "Red: lost. Ticks at the top: keyframes. Letters: the images below."
+        caption = "Red: lost. Ticks: keyframes. Masked: pixels left out. Letters: the images below."
         caption = caption if letters else caption.rpartition(" Letters")[0]
         drawing = draw_strip(run, letters, tops)
         strip = _two("Every frame", drawing, _STRIP_WIDE, _STRIP_NARROW, f"strip{place}", caption)
@@ -162,14 +173,16 @@ def _maps(runs: Sequence[SlamRun]) -> Section:
         name = "Map" if len(runs) == 1 else run.label
         if image is not None:
             picture = embed_image(image, 8 * len(runs))
-            figures.append(Figure(name, "Points of the map; orange: the camera.", picture=picture))
+            caption = "Points of the map; orange: path of the camera, from the white dot."
+            figures.append(Figure(name, caption, picture=picture, large=True))
         elif (run.folder / "map.png").is_file():
             picture = embed(run.folder / "map.png", 8 * len(runs))
-            figures.append(Figure(name, "The camera's path in red.", picture=picture))
+            caption = "The camera's path in red."
+            figures.append(Figure(name, caption, picture=picture, large=True))
     return Section("Map from above", figures=figures)
 
 
 def _two(title: str, draw: Draw, wide: Size, narrow: Size, name: str, caption: str = "") -> Figure:
-    """Return a figure over the page's whole width, drawn once for a screen, once for a telephone."""
+    """Return a figure over the whole width, drawn once for a screen and once for a telephone."""
     drawn = svg(draw, wide, name), svg(draw, narrow, f"{name}-narrow")
     return Figure(title, caption, *drawn, span=True)

@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,8 +82,11 @@ def svg(draw: Draw, size: Size, name: str) -> str:
     from matplotlib.figure import Figure
 
     buffer = io.StringIO()
-    with rc_context(_STYLE | {"svg.hashsalt": name}):
-        figure = Figure(figsize=(size.width / _PX_PER_INCH, size.height / _PX_PER_INCH), layout="constrained")
+    style: Any = {**_STYLE, "svg.hashsalt": name}
+    with rc_context(style):
+        figure = Figure(
+            figsize=(size.width / _PX_PER_INCH, size.height / _PX_PER_INCH), layout="constrained"
+        )
         draw(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, dpi=192)
     return _for_page(buffer.getvalue())
@@ -97,6 +100,13 @@ def legend(figure: "Figure", axes: "Axes") -> None:
     longest = max(len(label) for label in labels)
     columns = max(1, int(figure.get_figwidth() * 72 / (28 + 5.2 * longest)))
     figure.legend(handles, labels, loc="outside upper left", ncols=min(columns, len(labels)))
+
+
+def log_scale(axes: "Axes") -> None:
+    """Make the y axis logarithmic, with plain numbers."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")
 
 
 def _for_page(text: str) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cohdc_train.report.names import score_quantity
-from cohdc_train.report.svg import INK, Draw, color, dash, legend
+from cohdc_train.report.svg import INK, Draw, color, dash, legend, log_scale
 from cohdc_train.report.training_run import Series, TrainingRun
 
 if TYPE_CHECKING:
@@ -67,7 +67,8 @@ def draw_losses(runs: Placed) -> Draw:
         for place, run in runs if len(runs) > 1 else ():
             rows = run.part("train/").get("loss", np.zeros((0, 2)))
             _draw_smooth(axes, rows, color(place), run.label, 1.6, dash(place))
-        axes.set(xlabel="steps", ylabel="training loss", yscale="log")
+        axes.set(xlabel="steps", ylabel="training loss")
+        log_scale(axes)
         axes.set_xlim(left=0)
         legend(figure, axes)
 
@@ -88,7 +89,7 @@ def draw_rates(runs: Placed) -> Draw:
         axes.set(xlabel="steps", ylabel="learning rate")
         axes.set_ylim(bottom=0)
         axes.set_xlim(left=0)
-        axes.ticklabel_format(axis="y", scilimits=(-2, 3), useMathText=False)
+        axes.yaxis.set_major_formatter("{x:g}")
         legend(figure, axes)
 
     return draw

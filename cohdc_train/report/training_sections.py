@@ -1,6 +1,7 @@
 """The parts of a page about trainings."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from cohdc_train.report.names import count, score_quantity
@@ -66,20 +67,22 @@ def training_sections(runs: Sequence[TrainingRun]) -> list[Section]:
 
 
 def picture_figures(files: Sequence[Path], images: int) -> list[Figure]:
-    """Return figures of a validation's images, the grids over the whole width. images: of the page."""
+    """Return figures of a validation's images, the grids over the whole width.
+
+    images: how many the page has.
+    """
     figures = []
     for file in files:
         title, caption = TITLES.get(file.name, (file.stem, ""))
         grid = file.suffix == ".jpg"
-        figures.append(Figure(title, caption, picture=embed(file, images), span=grid))
+        figure = Figure(title, caption, picture=embed(file, images), span=grid, chart=not grid)
+        figures.append(replace(figure, large=file.name == "pr_curves.png"))
     return figures
 
 
 def score_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
     """Return a table of segmentation scores, classes left out. columns: head -> scores by name."""
-    names = list(
-        dict.fromkeys(name for scores in columns.values() for name in scores if "/" not in name)
-    )
+    names = sorted({n for scores in columns.values() for n in scores if "/" not in n}, key=_order)
     rows = [
         [
             score_quantity(name).title,
@@ -88,6 +91,12 @@ def score_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
         for name in names
     ]
     return Table("", ["Score", *columns], rows)
+
+
+def _order(score: str) -> tuple[int, str]:
+    """Return the place of a score in a table: masks, boundaries, boxes, and what is left."""
+    kinds = ("segm_", "boundary_", "box_")
+    return next((k for k, kind in enumerate(kinds) if score.startswith(kind)), len(kinds)), score
 
 
 def _lead(run: TrainingRun) -> str:
@@ -154,7 +163,7 @@ def _comparison(runs: Sequence[TrainingRun]) -> Table:
     head = ["Run", *(score_quantity(name).title for name in names), "Steps", "Epochs"]
     better = [0, *(score_quantity(name).better for name in names), 0, 0]
     best = mark_best(rows, better)
-    return Table("", head, rows, best, "Bold: the best of a column." if best else "")
+    return Table("", head, rows, best=best, note="Bold: the best of a column." if best else "")
 
 
 def _classes(runs: Sequence[TrainingRun]) -> Section:

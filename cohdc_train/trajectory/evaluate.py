@@ -57,7 +57,7 @@ def evaluate(
     Args:
         groundtruth: TUM file of the true trajectory.
         estimate: TUM file of the estimated trajectory.
-        out: JSON file to write the same numbers to.
+        out: JSON file to write the same numbers to, and the names of both files.
         max_difference: largest difference of two stamps that are taken as one moment, s.
     """
     truth, guess = read_tum(groundtruth), read_tum(estimate)
@@ -75,5 +75,6 @@ def evaluate(
     )
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, result)
+        files = {"groundtruth": str(groundtruth.resolve()), "estimate": str(estimate.resolve())}
+        write_json(out, {**result, **files})  # `cohdc report` draws what lies there
     return result
