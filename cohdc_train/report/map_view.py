@@ -85,8 +85,8 @@ def _draw(points: Floats, colors: Image, path: Floats) -> Image:
     places = (path - low) * scale + _BORDER
     for part in np.split(places, np.flatnonzero(~np.isfinite(places[:, 0]))):
         line = np.rint(part[np.isfinite(part[:, 0])]).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(image, [line], False, _WHITE, 5, cv2.LINE_AA)
-        cv2.polylines(image, [line], False, _PATH, 3, cv2.LINE_AA)
+        cv2.polylines(image, [line], False, _WHITE, 4, cv2.LINE_AA)
+        cv2.polylines(image, [line], False, _PATH, 2, cv2.LINE_AA)
     cv2.circle(image, np.rint(places[0]).astype(int).tolist(), 7, _WHITE, -1, cv2.LINE_AA)
     _draw_scale(image, scale)
     return image
@@ -108,10 +108,10 @@ def _draw_scale(image: Image, scale: float) -> None:
     meters = scale_length(image.shape[1] / scale)
     length, y = round(meters * scale), image.shape[0] - 20
     text = f"{meters:g} m" if meters >= 1 else f"{100 * meters:g} cm"
-    box = image[y - 42 : y + 14, 10 : 34 + max(length, 90)]
+    box = image[y - 66 : y + 14, 10 : 34 + max(length, 150)]
     box[:] = box // 3
     cv2.line(image, (22, y), (22 + length, y), _WHITE, 4)
     for x in (22, 22 + length):
         cv2.line(image, (x, y - 7), (x, y + 7), _WHITE, 3)
     font = cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(image, text, (22, y - 14), font, 0.75, _WHITE, 2, cv2.LINE_AA)
+    cv2.putText(image, text, (22, y - 18), font, 1.3, _WHITE, 3, cv2.LINE_AA)

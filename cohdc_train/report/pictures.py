@@ -36,9 +36,10 @@ def embed(file: Path, images: int) -> Picture:
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error}") from error
     array = np.frombuffer(content, np.uint8)
-    image = cv2.imdecode(array, cv2.IMREAD_COLOR) if len(array) else None
-    if image is None:
+    decoded = cv2.imdecode(array, cv2.IMREAD_COLOR) if len(array) else None
+    if decoded is None:
         raise DataError(f"{file}: cannot be read as an image")
+    image = np.asarray(decoded, np.uint8)
     limit = min(_LARGEST, IMAGES_BYTES // max(1, images))
     height, width = image.shape[:2]
     kind = _kind(content)

@@ -29,6 +29,7 @@ CAMERA_VIEWS: Sequence[View] = (
 )
 _DrawRow = Callable[["Axes", Frames, Floats], None]
 _BINS = 700  # columns of a strip: more are not seen
+_FOUR_NAMES = 6.0  # inches of a figure that has room for a legend's four names in a line
 _SEGMENTS = 250  # pieces of a path with a color of their own
 _LOG_FROM = 8.0  # ratio of two runs' errors from which the axis is logarithmic
 _SHADES = (0.08, 0.9)  # part of the color map that is seen on white and on black
@@ -199,7 +200,9 @@ def _draw_times(axes: "Axes", frames: Frames, times: Floats) -> None:
         axes.axhline(
             interval, color=INK, lw=0.9, ls=(0, (4, 3)), label=f"camera, {interval:.0f} ms"
         )
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 0.98), ncols=4, borderpad=0, columnspacing=1.2)
+    columns = 4 if axes.get_figure(root=True).get_figwidth() > _FOUR_NAMES else 2
+    place = {"loc": "lower left", "bbox_to_anchor": (0, 0.98)}
+    axes.legend(**place, ncols=columns, borderpad=0, columnspacing=1.2)
 
 
 def _mark_lost(axes: "Axes", frames: Frames, times: Floats) -> None:

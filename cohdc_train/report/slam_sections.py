@@ -65,7 +65,10 @@ def _trajectories(runs: Sequence[tuple[int, SlamRun]], truth: Trajectory | None)
         words = ["Meters from the first camera, equal axes; gaps are where tracking was lost."]
         return Section("Trajectory", words, figures=figures)
     meanwhile = _during(truth, [run for _, run in shown])
-    figures = [_path(k, view, meanwhile, shown) for k, view in enumerate(TRUTH_VIEWS)]
+    views = TRUTH_VIEWS if len(runs) > 1 else TRUTH_VIEWS[:2]  # the third place is the error's
+    figures = [_path(k, view, meanwhile, shown) for k, view in enumerate(views)]
+    if len(runs) == 1:
+        figures += _error_paths(shown, 1)
     words = ["Rigidly aligned to the ground truth, equal axes; gaps are where tracking was lost."]
     return Section("Trajectory", words, figures=figures)
 
@@ -102,7 +105,7 @@ def _errors(runs: Sequence[tuple[int, SlamRun]]) -> Section:
     if not shown:
         return Section("Errors", tables=tables)
     over_time = _two("Error over time", draw_errors(shown), _WIDE, _NARROW, "errors")
-    figures = [over_time, *_error_paths(shown, len(runs))]
+    figures = [over_time, *(_error_paths(shown, len(runs)) if len(runs) > 1 else [])]
     return Section("Errors", tables=tables, figures=figures)
 
 

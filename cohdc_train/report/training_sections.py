@@ -187,7 +187,7 @@ def _classes(runs: Sequence[TrainingRun]) -> Section:
 def _scores(run: TrainingRun) -> Section:
     step = run.best_step()
     best = {} if step is None else {f"Best validation, step {step:.0f}": run.best_scores()}
-    columns = best | dict(run.validated)
+    columns = best | {f"cohdc validate, {name}": found for name, found in run.validated.items()}
     return Section("Scores", tables=[score_table(columns)] if columns else [])
 
 

@@ -36,7 +36,10 @@ class Browser:
         self._folder, self._url = folder, url
 
     def run(self, page: str, width: int, script: str, height: int = 900) -> dict[str, Any]:
-        """Return what a script puts into `answer`; `page` is the page's window, `frame` around it."""
+        """Return what a script puts into `answer`.
+
+        page: name of a file; the script has its window as `page`, and the frame as `frame`.
+        """
         name = self._frame(page, width, height, script)
         dom = self._chromium("--dump-dom", "--virtual-time-budget=20000", name=name, width=width)
         match = re.search(r'<pre id="answer">(.+?)</pre>', dom, re.DOTALL)
