@@ -189,7 +189,7 @@ def _run_function(component: Any, args: list[str], prog: str) -> None:
         """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
-            if names[0] in lists:  # RUN [RUN ...] instead of a list in brackets
+            if not names[0].startswith("-") and names[0] in lists:  # RUN [RUN ...]
                 metavar = names[0].removesuffix("s").upper()
                 kwargs = {"type": lists[names[0]], "nargs": "+", "help": kwargs["help"]}
                 kwargs["metavar"] = metavar

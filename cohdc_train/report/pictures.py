@@ -11,7 +11,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.report.page import Picture
 
 PAGE_BYTES = 5_000_000
-IMAGES_BYTES = 2_600_000  # of a page, before base64 makes four bytes of three
+IMAGES_BYTES = 2_000_000  # of a page, before base64 makes four bytes of three
 _LARGEST = 800_000  # bytes of one image
 _STEPS = (
     (2400, 85),

@@ -1,7 +1,7 @@
 """SLAM runs drawn: paths with equal axes, errors on one scale, and a strip with every frame."""
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,24 @@ CAMERA_VIEWS: Sequence[View] = (
     ("From behind", 0, 1, -1),
     ("From the side", 2, 1, -1),
 )
-_DrawRow = Callable[["Axes", Frames, Floats], None]
-_BINS = 700  # columns of a strip: more are not seen
+_DrawRow = Callable[["Axes", Frames, Floats, int], None]
+_BINS_PER_INCH = 48.0  # columns of a strip of one run: more are not seen
+_LINE_POINTS = 5000  # of all lines of a figure together
+_FEWEST_POINTS = 250  # of a line
 _FOUR_NAMES = 6.0  # inches of a figure that has room for a legend's four names in a line
 _SEGMENTS = 250  # pieces of a path with a color of their own
 _LOG_FROM = 8.0  # ratio of two runs' errors from which the axis is logarithmic
 _SHADES = (0.08, 0.9)  # part of the color map that is seen on white and on black
+
+
+class StripScale(NamedTuple):
+    """What strips of several runs have in common, so that they can be compared.
+
+    tops: row -> upper end of its axis; bins_per_inch: columns of a strip.
+    """
+
+    tops: Mapping[str, float]
+    bins_per_inch: float
 
 
 def draw_paths(view: View, truth: Trajectory | None, runs: Sequence[tuple[int, SlamRun]]) -> Draw:
@@ -56,6 +68,7 @@ def draw_paths(view: View, truth: Trajectory | None, runs: Sequence[tuple[int, S
             )
         for place, run in runs:
             points = run.path()[1]
+            points = points[_thinned(points[:, 0], len(runs))]
             axes.plot(
                 points[:, i], sign * points[:, j], dash(place), color=color(place), label=run.label
             )
@@ -112,8 +125,9 @@ def draw_errors(runs: Sequence[tuple[int, SlamRun]]) -> Draw:
             if errors is not None:
                 stamps, distances = errors
                 typical.append(float(np.nanmedian(distances)))
-                times = stamps - run.start
-                axes.plot(times, distances, dash(place), color=color(place), label=run.label)
+                kept = _thinned(distances, len(runs))
+                times = stamps[kept] - run.start
+                axes.plot(times, distances[kept], dash(place), color=color(place), label=run.label)
         if typical and max(typical) > _LOG_FROM * max(min(typical), 1e-6):
             log_scale(axes)
         else:
@@ -125,11 +139,10 @@ def draw_errors(runs: Sequence[tuple[int, SlamRun]]) -> Draw:
     return draw
 
 
-def draw_strip(run: SlamRun, letters: dict[int, str], tops: dict[str, float]) -> Draw:
+def draw_strip(run: SlamRun, letters: dict[int, str], scale: StripScale) -> Draw:
     """Return a drawing of every frame: inliers, masked share, times; lost frames are red.
 
-    letters: index of a frame -> the letter below which its image is shown; tops: row -> upper end
-    of its axis, so that runs can be compared.
+    letters: index of a frame -> the letter below which its image is shown; scale: of all runs.
     """
     frames = run.frames
     if frames is None:
@@ -143,21 +156,30 @@ def draw_strip(run: SlamRun, letters: dict[int, str], tops: dict[str, float]) ->
     def draw(figure: "Figure") -> None:
         heights = [1.3, *[1.0] * (len(rows) - 1)]
         panels = np.ravel(figure.subplots(len(rows), 1, sharex=True, height_ratios=heights))
+        bins = round(scale.bins_per_inch * figure.get_figwidth())
         for (name, draw_row), axes in zip(rows.items(), panels, strict=True):
-            draw_row(axes, frames, times)
+            draw_row(axes, frames, times, bins)
             _mark_lost(axes, frames, times)
-            axes.set(ylabel=name, ylim=(0, max(1e-6, 1.05 * tops[name])))
+            axes.set(ylabel=name, ylim=(0, 1.05 * scale.tops[name]))
             axes.grid(axis="x", visible=False)
-        _mark_frames(panels[0], times, letters, 1.05 * tops["inliers"])
+        _mark_frames(panels[0], times, letters, 1.05 * scale.tops["inliers"])
         panels[-1].set_xlabel("time, s")
         panels[-1].set_xlim(times[0], max(times[-1], times[0] + 1e-3))
+        columns = 4 if figure.get_figwidth() > _FOUR_NAMES else 2
+        panels[-1].legend(
+            loc="lower left",
+            bbox_to_anchor=(0, 0.98),
+            ncols=columns,
+            borderpad=0,
+            columnspacing=1.2,
+        )
         figure.align_ylabels(list(panels))
 
     return draw
 
 
-def strip_tops(runs: Sequence[SlamRun]) -> dict[str, float]:
-    """Return the upper ends of a strip's axes that all runs fit in."""
+def strip_scale(runs: Sequence[SlamRun]) -> StripScale:
+    """Return the scale of strips that all runs fit in."""
     tops = {"inliers": 1.0, "masked, %": 1.0, "time, ms": 1.0}
     for run in runs:
         if run.frames is not None and len(run.frames):
@@ -166,11 +188,11 @@ def strip_tops(runs: Sequence[SlamRun]) -> dict[str, float]:
             tops["inliers"] = max(tops["inliers"], float(columns["inliers"].max()))
             tops["masked, %"] = max(tops["masked, %"], float(100 * columns["culled_share"].max()))
             tops["time, ms"] = max(tops["time, ms"], float(np.quantile(total, 0.998)))
-    return tops
+    return StripScale(tops, min(_BINS_PER_INCH, 4 * _BINS_PER_INCH / len(runs)))
 
 
-def _draw_inliers(axes: "Axes", frames: Frames, times: Floats) -> None:
-    x, low = _binned(times, frames.columns["inliers"], np.minimum)
+def _draw_inliers(axes: "Axes", frames: Frames, times: Floats, bins: int) -> None:
+    x, low = _binned(times, frames.columns["inliers"], np.minimum, bins)
     axes.fill_between(x, low, step="mid", color=SERIES[0], alpha=0.75, lw=0)
     keyframes = times[frames.columns["keyframe"] > 0]
     top = axes.get_xaxis_transform()
@@ -179,18 +201,18 @@ def _draw_inliers(axes: "Axes", frames: Frames, times: Floats) -> None:
     )
 
 
-def _draw_masked(axes: "Axes", frames: Frames, times: Floats) -> None:
-    x, high = _binned(times, 100 * frames.columns["culled_share"], np.maximum)
+def _draw_masked(axes: "Axes", frames: Frames, times: Floats, bins: int) -> None:
+    x, high = _binned(times, 100 * frames.columns["culled_share"], np.maximum, bins)
     axes.fill_between(x, high, step="mid", color=SERIES[3], alpha=0.75, lw=0)
 
 
-def _draw_times(axes: "Axes", frames: Frames, times: Floats) -> None:
+def _draw_times(axes: "Axes", frames: Frames, times: Floats, bins: int) -> None:
     below: Floats | float = 0.0
     stages = {"segment_ms": "segmentation", "track_ms": "tracking", "map_ms": "mapping"}
     for place, (column, name) in zip((3, 0, 4), stages.items(), strict=True):
         if not frames.columns[column].any():
             continue
-        x, high = _binned(times, frames.columns[column], np.maximum)
+        x, high = _binned(times, frames.columns[column], np.maximum, bins)
         axes.fill_between(
             x, below, below + high, step="mid", color=SERIES[place], alpha=0.85, lw=0, label=name
         )
@@ -200,9 +222,6 @@ def _draw_times(axes: "Axes", frames: Frames, times: Floats) -> None:
         axes.axhline(
             interval, color=INK, lw=0.9, ls=(0, (4, 3)), label=f"camera, {interval:.0f} ms"
         )
-    columns = 4 if axes.get_figure(root=True).get_figwidth() > _FOUR_NAMES else 2
-    place = {"loc": "lower left", "bbox_to_anchor": (0, 0.98)}
-    axes.legend(**place, ncols=columns, borderpad=0, columnspacing=1.2)
 
 
 def _mark_lost(axes: "Axes", frames: Frames, times: Floats) -> None:
@@ -225,12 +244,27 @@ def _mark_frames(axes: "Axes", times: Floats, letters: dict[int, str], top: floa
         axes.axvline(times[index], color=INK, lw=0.7, alpha=0.7)
 
 
-def _binned(times: Floats, values: Floats, combine: "np.ufunc") -> tuple[Floats, Floats]:
-    """Return at most `_BINS` times and values; a bin's value is its lowest or its highest."""
-    if len(times) <= _BINS:
+def _binned(times: Floats, values: Floats, combine: "np.ufunc", bins: int) -> tuple[Floats, Floats]:
+    """Return times and values of a number of bins; a bin's value is its lowest or its highest."""
+    if len(times) <= bins:
         return times, values
-    starts = np.unique(np.linspace(0, len(times), _BINS, endpoint=False).astype(int))
+    starts = np.unique(np.linspace(0, len(times), bins, endpoint=False).astype(int))
     return times[starts], np.asarray(combine.reduceat(values, starts))
+
+
+def _thinned(values: Floats, runs: int) -> NDArray[np.int64]:
+    """Return indices of a line's points that are drawn: of every few the highest, and all gaps.
+
+    values: [n], nan at gaps; runs: lines of the figure, which share `_LINE_POINTS`.
+    """
+    step = -(-len(values) // max(_FEWEST_POINTS, _LINE_POINTS // runs))
+    if step < 2:
+        return np.arange(len(values))
+    highest = [
+        start + int(np.argmax(np.nan_to_num(values[start : start + step], nan=-np.inf)))
+        for start in range(0, len(values), step)
+    ]
+    return np.unique([*highest, *np.flatnonzero(np.isnan(values))])
 
 
 def _pieces(points: Floats, values: Floats) -> tuple[list[NDArray[np.float64]], Floats]:

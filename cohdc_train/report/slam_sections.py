@@ -17,7 +17,7 @@ from cohdc_train.report.slam_plots import (
     draw_errors,
     draw_paths,
     draw_strip,
-    strip_tops,
+    strip_scale,
 )
 from cohdc_train.report.slam_run import SlamRun
 from cohdc_train.report.svg import Draw, Size, svg
@@ -26,6 +26,7 @@ from cohdc_train.trajectory.trajectory import Trajectory
 
 _SQUARE, _WIDE, _NARROW = Size(430, 400), Size(1080, 300), Size(380, 330)
 _STRIP_WIDE, _STRIP_NARROW = Size(1080, 390), Size(380, 400)
+_DETAILED = 10  # runs whose frames and maps are shown: a page is to stay below 5 MB
 _ERROR_PATHS = 6  # runs whose paths are drawn one by one
 _WORST = {1: 6, 2: 6, 3: 4}  # runs -> worst frames of each; of more runs two
 
@@ -49,11 +50,19 @@ def slam_sections(runs: Sequence[SlamRun], truth: Trajectory | None) -> list[Sec
         *(summary if len(runs) > 1 else []),
         _trajectories(placed, truth),
         _errors(placed),
-        *_strips(placed),
-        _maps(runs),
+        *(_details(placed) if len(runs) <= _DETAILED else [_too_many(len(runs))]),
         Section("Time", tables=slam_facts.time_table(runs)),
         Section("Options", tables=differing, folded=every),
     ]
+
+
+def _details(runs: Sequence[tuple[int, SlamRun]]) -> list[Section]:
+    return [*_strips(runs), _maps([run for _, run in runs])]
+
+
+def _too_many(runs: int) -> Section:
+    words = f"Of {runs} runs there are no frames and maps; a page of {_DETAILED} or fewer has them."
+    return Section("Where tracking was weak", [words])
 
 
 def _trajectories(runs: Sequence[tuple[int, SlamRun]], truth: Trajectory | None) -> Section:
@@ -111,7 +120,7 @@ def _errors(runs: Sequence[tuple[int, SlamRun]]) -> Section:
 
 def _strips(runs: Sequence[tuple[int, SlamRun]]) -> list[Section]:
     """Return a part per run: the strip of its frames, and images of the worst."""
-    tops = strip_tops([run for _, run in runs])
+    scale = strip_scale([run for _, run in runs])
     sections = []
     for place, run in runs:
         if run.frames is None or not len(run.frames):
@@ -120,7 +129,7 @@ def _strips(runs: Sequence[tuple[int, SlamRun]]) -> list[Section]:
         letters = {index: chr(ord("A") + k) for k, (index, _) in enumerate(worst)}
         caption = "Red: lost. Ticks: keyframes. Masked: pixels left out. Letters: the images below."
         caption = caption if letters else caption.rpartition(" Letters")[0]
-        drawing = draw_strip(run, letters, tops)
+        drawing = draw_strip(run, letters, scale)
         strip = _two("Every frame", drawing, _STRIP_WIDE, _STRIP_NARROW, f"strip{place}", caption)
         title = "Where tracking was weak" + (f": {run.label}" if len(runs) > 1 else "")
         images = [

@@ -88,6 +88,7 @@ def svg(draw: Draw, size: Size, name: str) -> str:
             figsize=(size.width / _PX_PER_INCH, size.height / _PX_PER_INCH), layout="constrained"
         )
         draw(figure)
+        _settle(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, dpi=192)
     return _for_page(buffer.getvalue())
 
@@ -109,6 +110,20 @@ def log_scale(axes: "Axes") -> None:
     axes.yaxis.set_minor_formatter("")
 
 
+def _settle(figure: "Figure") -> None:
+    """Lay a figure out once, and round the places of its axes.
+
+    The layout's solver differs in its last digits from call to call, and with it the page.
+    """
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        box = axes.get_position(original=True)
+        axes.set_position([round(float(value), 4) for value in box.bounds])
+
+
 def _for_page(text: str) -> str:
     """Return the element alone, with the page's colors and font, and without its own size."""
     text = text[text.index("<svg") :]
@@ -124,5 +139,6 @@ def _for_page(text: str) -> str:
 
 
 def _rounded(attribute: re.Match[str]) -> str:
-    """Return an attribute's coordinates with two digits: a hundredth of a point is not seen."""
-    return re.sub(r"(\.\d\d)\d+", r"\1", attribute[0])
+    """Return an attribute's coordinates with one digit: a tenth of a point is not seen."""
+    short = re.sub(r"\d+\.\d+", lambda number: f"{float(number[0]):.1f}", attribute[0])
+    return re.sub(r"\s+", " ", short).replace(" L ", "L").replace(" M ", "M")

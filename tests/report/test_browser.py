@@ -21,6 +21,7 @@ MEASURE = """
 for (const width of WIDTHS) {
   frame.style.width = `${width}px`;
   await new Promise((done) => setTimeout(done, 100));
+  const scale = (matrix) => Math.hypot(matrix.a, matrix.b);
   const right = (item) => item.getBoundingClientRect().right;
   const all = [...page.document.querySelectorAll("body *")];
   const inside = (item) => item.closest(".scroll, dialog, svg") || right(item) <= width + 1;
@@ -31,7 +32,7 @@ for (const width of WIDTHS) {
     width: page.innerWidth,
     content: page.document.documentElement.scrollWidth,
     outside: outside.map((item) => item.outerHTML.slice(0, 120)),
-    letters: texts.map((item) => parseFloat(item.style.fontSize) * item.getScreenCTM().a),
+    letters: texts.map((item) => parseFloat(item.style.fontSize) * scale(item.getScreenCTM())),
   };
 }
 """.replace("WIDTHS", str(list(WIDTHS)))

@@ -7,11 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from report_runs import START, Page, trajectory, write_slam_run, write_truth
+from report_runs import RATE, START, Page, trajectory, write_slam_run, write_truth
 
 from cohdc_train.errors import DataError
 from cohdc_train.report import Table, report, write_report
 from cohdc_train.report.map_view import draw_map, read_points, scale_length
+from cohdc_train.report.slam_plots import _thinned
 from cohdc_train.report.slam_run import find_groundtruth, read_slam_run
 from cohdc_train.trajectory.trajectory import read_tum
 
@@ -112,6 +113,30 @@ def test_comparison_has_a_row_per_run_and_marks_the_best(tmp_path: Path, truth_f
     assert {"model", "none", "person.onnx"} <= set(page.cells[page.cells.index("model") :][:4])
     assert "Where the error is: masks" in page.captions
     assert page.facts["Sequence"] == "room"
+
+
+@pytest.mark.parametrize("number", [10, 11])
+def test_page_of_many_runs_stays_small(tmp_path: Path, truth_file: Path, number: int) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    runs = []
+    for k in range(number):
+        folder = write_slam_run(tmp_path / f"run{k}", 0.01, sequence=truth_file.parent)
+        for index in (3, 20, 40, 50):
+            stamp = f"{START + index / RATE:.6f}"
+            cv2.imwrite(str(folder / "pictures" / f"{stamp}_worst.jpg"), noise)
+        runs.append(folder)
+    page = open_page(report(runs, out=tmp_path / "page.html"))
+    assert len(page.images) == (30 if number == 10 else 0), "a map and two frames of each run"
+    assert ("Of 11 runs there are no frames and maps" in page.text) == (number == 11)
+
+
+def test_long_run_is_drawn_with_its_peaks_and_gaps() -> None:
+    values = np.ones(100_000)
+    values[77_777], values[5_000] = 9, np.nan
+    kept = _thinned(values, 2)
+    assert len(kept) < 3_000
+    assert {5_000, 77_777} <= set(kept.tolist())
+    assert _thinned(values[:100], 2).tolist() == list(range(100))
 
 
 def test_runs_of_two_sequences_are_not_laid_over_each_other(tmp_path: Path) -> None:
