@@ -195,6 +195,12 @@ def comparison(runs: Sequence[SlamRun]) -> Table:
         [run.label, *("–" if v[i] is None else f"{v[i]:.{digits}f}" for _, _, v, digits in columns)]
         for i, run in enumerate(runs)
     ]
-    best = mark_best(rows, [0, *(better for _, better, _, _ in columns)])
+    head = ["Run", *(name for name, *_ in columns)]
+    masks = [_masks(run.config)[0] if run.config else "" for run in runs]
+    if any(masks):
+        head.insert(1, "Masks")
+        rows = [[row[0], name, *row[1:]] for row, name in zip(rows, masks, strict=True)]
+    words = len(head) - len(columns)
+    best = mark_best(rows, [0] * words + [better for _, better, _, _ in columns])
     note = "Bold: the best of a column." if best else ""
-    return Table("", ["Run", *(name for name, *_ in columns)], rows, best=best, note=note)
+    return Table("", head, rows, words, best, note)

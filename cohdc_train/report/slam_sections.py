@@ -24,7 +24,7 @@ from cohdc_train.report.svg import Draw, Size, svg
 from cohdc_train.report.tables import options
 from cohdc_train.trajectory.trajectory import Trajectory
 
-_SQUARE, _WIDE, _NARROW = Size(430, 400), Size(1080, 300), Size(380, 330)
+_SQUARE, _WIDE, _NARROW = Size(370, 350), Size(1080, 300), Size(380, 330)
 _STRIP_WIDE, _STRIP_NARROW = Size(1080, 390), Size(380, 400)
 _DETAILED = 10  # runs whose frames and maps are shown: a page is to stay below 5 MB
 _ERROR_PATHS = 6  # runs whose paths are drawn one by one

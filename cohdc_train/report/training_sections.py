@@ -17,7 +17,7 @@ from cohdc_train.report.training_plots import (
 )
 from cohdc_train.report.training_run import TrainingRun
 
-_PLOT = Size(430, 330)
+_PLOT = Size(370, 300)
 _CLASSES = 20  # in the plot; the table has all
 _COMPARED = ("segm_AP", "segm_AP50", "segm_AP75", "boundary_AP", "box_AP", "mIoU")
 TITLES: Mapping[str, tuple[str, str]] = {
@@ -172,7 +172,7 @@ def _classes(runs: Sequence[TrainingRun]) -> Section:
     if not names:
         return Section("Classes")
     shown = names[:_CLASSES]
-    size = Size(430, 90 + 24 * len(shown) * max(1.0, 0.5 * len(runs)))
+    size = Size(370, 90 + 24 * len(shown) * max(1.0, 0.5 * len(runs)))
     caption = f"The best {_CLASSES} of {len(names)} classes." if len(shown) < len(names) else ""
     figure = Figure(
         "Mask AP per class", caption, wide=svg(draw_classes(scores, shown), size, "classes")

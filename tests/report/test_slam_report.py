@@ -106,7 +106,7 @@ def test_comparison_has_a_row_per_run_and_marks_the_best(tmp_path: Path, truth_f
     page = open_page(out)
     assert page.heads[:2] == ["Runs side by side", "Trajectory"]
     first = page.cells[: page.cells.index("masks")]
-    assert first[:3] == ["plain", "75.0", "15"]
+    assert first[:4] == ["plain", "none", "75.0", "15"]
     text = out.read_text("utf-8")
     best = json.loads((runs[1] / "metrics.json").read_text())["ate_m"]["rmse"]
     assert f'<td class="best">{best:.4f}</td>' in text
