@@ -1,4 +1,4 @@
-"""What a user gets: the built wheel in a clean environment, and the Dockerfiles."""
+"""Packaging: the built wheel in a clean environment, and the Dockerfiles."""
 
 import json
 import os
@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from tool_loader import load_tool
 
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCKERFILES = sorted((ROOT / "docker").glob("*.Dockerfile"))
 
 
 def draw_sequence(folder: Path, frames: int = 12) -> None:
-    """A TUM folder of a camera that glides past a textured wall 2 m away, 3 cm a frame."""
+    """Write a TUM folder of a camera that glides past a textured wall 2 m away, 3 cm a frame."""
     size, focal, depth_m, step = (240, 320), 260.0, 2.0, 0.03
     rng = np.random.default_rng(0)
     wall = cv2.GaussianBlur(rng.integers(0, 256, (240, 480), np.uint8), (0, 0), 1.5)
@@ -50,11 +50,11 @@ def draw_sequence(folder: Path, frames: int = 12) -> None:
         "depth_scale": 5000,
     }
     (folder / "camera.yaml").write_text(json.dumps(camera))  # JSON is YAML
-    write_tum(folder / "groundtruth.txt", Trajectory(np.arange(frames) / 30, poses))
+    Trajectory(np.arange(frames) / 30, poses).save_tum(folder / "groundtruth.txt")
 
 
 class Clean:
-    """A fresh environment, used from a folder that is not the repository."""
+    """Fresh environment, used from a folder outside the repository."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -102,7 +102,7 @@ def test_wheel_runs_outside_the_repository_without_torch(clean: Clean) -> None:
     where, torch = clean.run("python", "-c", code).split()
     assert Path(where).is_relative_to(clean.folder)
     assert torch == "None"
-    assert "no fault found" in clean.run("cohdc", "env")
+    assert "no problem found" in clean.run("cohdc", "env")
 
 
 @pytest.mark.slow
@@ -182,7 +182,8 @@ def test_checker_follows_a_dockerfile(tmp_path: Path, monkeypatch: pytest.Monkey
     file = tmp_path / "Dockerfile"
     file.write_text(
         "# comment\nFROM x\nCOPY b.txt ./\nCOPY room room\nENV WORD=said\n"
-        "RUN apt-get update \\\n && false\nRUN cat room/a.txt \\\n  b.txt > both && echo $WORD >> both\n"
+        "RUN apt-get update \\\n && false\n"
+        "RUN cat room/a.txt \\\n  b.txt > both && echo $WORD >> both\n"
     )
     (tmp_path / "build").mkdir()
     assert tool.follow(file, tmp_path / "build")["WORD"] == "said"

@@ -1,4 +1,4 @@
-"""What README says can be done: its commands parse, its links lead somewhere."""
+"""README: its commands parse, its links lead to files."""
 
 import functools
 import importlib
@@ -12,7 +12,7 @@ from unittest import mock
 
 import pytest
 
-from cohdc_train.cli import VERBS, main
+from cohdc_train.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -20,12 +20,11 @@ LIGHTNING = ("fit",)  # Lightning parses it by itself
 
 
 def commands(text: str) -> list[list[str]]:
-    """The words after `cohdc` of every command in a text's code blocks, fenced or indented, and in
-    its sentences.
+    """List the words after `cohdc` of every command in a text's code blocks and sentences.
 
-    A sentence may speak of `cohdc VERB`; with options it is a command. Continued lines are joined,
-    comments and redirections dropped; a line counts when it, or what follows && or ;, begins with
-    cohdc or a path to it.
+    A sentence may mention `cohdc COMMAND`; with options it is a command. Continued lines are
+    joined, comments and redirections dropped. A line counts when it, or what follows && or ;,
+    begins with cohdc or a path to it.
     """
     fenced = re.findall(r"```[a-z]*\n(.*?)```", text, flags=re.DOTALL)
     plain = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
@@ -46,7 +45,7 @@ def commands(text: str) -> list[list[str]]:
 
 
 def stilled(component: Any) -> Any:
-    """A verb that looks the same to the parser and does nothing; a group of verbs likewise."""
+    """Wrap a command, or a group of them: the same signature, and no effect."""
     if isinstance(component, dict):
         return {name: stilled(function) for name, function in component.items()}
 
@@ -58,8 +57,8 @@ def stilled(component: Any) -> Any:
 
 
 def check(words: list[str]) -> int:
-    """Give a command to `cohdc` without running its verb; returns the exit code."""
-    verb = VERBS.get(words[0]) if words else None
+    """Parse a command of `cohdc` without running it; returns the exit code."""
+    verb = COMMANDS.get(words[0]) if words else None
     if verb is None:
         return main(words)
     module = importlib.import_module(f"cohdc_train.{verb.module}")
@@ -70,12 +69,12 @@ def check(words: list[str]) -> int:
         return ended.code if isinstance(ended.code, int) else 2
 
 
-COMMANDS = commands(README)
+README_COMMANDS = commands(README)
 
 
 @pytest.mark.parametrize(
     "words",
-    [words for words in COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
+    [words for words in README_COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
     ids=" ".join,
 )
 def test_command_parses(words: list[str]) -> None:
@@ -84,7 +83,9 @@ def test_command_parses(words: list[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [words for words in COMMANDS if words[:1] in [[v] for v in LIGHTNING]], ids=" ".join
+    "words",
+    [words for words in README_COMMANDS if words[:1] in [[v] for v in LIGHTNING]],
+    ids=" ".join,
 )
 def test_training_command_parses(words: list[str]) -> None:
     done = subprocess.run(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, list_files, write_text
+from cohdc_train.report.images import embed
 from cohdc_train.report.page import Figure, Page, Section, Table
-from cohdc_train.report.pictures import embed
 from cohdc_train.report.scores import (
     BENCH_FILE,
     bench_page,
@@ -19,9 +19,9 @@ from cohdc_train.report.scores import (
 )
 from cohdc_train.report.slam_run import SlamRun, find_groundtruth, read_slam_run
 from cohdc_train.report.slam_sections import slam_page
-from cohdc_train.report.training_run import PICTURES, logs, read_training_run
+from cohdc_train.report.training_run import VALIDATION_IMAGES, logs, read_training_run
 from cohdc_train.report.training_sections import training_page
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 PAGE = "report.html"
 _NAMED = 3  # runs that stand in a page's title
@@ -103,10 +103,10 @@ def write_report(
     Raises:
         DataError: a file of a run or an image cannot be used; it is named.
     """
-    truth = None if groundtruth is None else read_tum(groundtruth)
+    truth = None if groundtruth is None else Trajectory.load_tum(groundtruth)
     page = slam_page(title, [read_slam_run(*item, truth) for item in runs.items()], truth)
     images = len(overlays) + 8 * len(runs)
-    masks = [Figure(file.stem, picture=embed(file, images)) for file in overlays]
+    masks = [Figure(file.stem, image=embed(file, images)) for file in overlays]
     summary = [Section(table.title, tables=[_untitled(table)]) for table in tables]
     sections = [*summary, *page.sections, Section("Predicted masks", figures=masks)]
     _write(out, Page(page.title, page.kind, page.lead, page.facts, sections))
@@ -126,7 +126,7 @@ def kind_of(path: Path) -> Kind:
         if (path / BENCH_FILE).is_file():
             return Kind.BENCH
         files = sorted(path.glob("*.json"))
-        if validated_scores(path) or any((path / name).is_file() for name in PICTURES):
+        if validated_scores(path) or any((path / name).is_file() for name in VALIDATION_IMAGES):
             return Kind.VALIDATION
     if any(validated_scores(file) for file in files):
         return Kind.VALIDATION
@@ -172,7 +172,7 @@ def _slam_pages(runs: Mapping[str, Path], groundtruth: Path | None) -> list[Page
         groups.setdefault(file, {})[label] = folder
     pages = []
     for file, members in groups.items():
-        truth = None if file is None else read_tum(file)
+        truth = None if file is None else Trajectory.load_tum(file)
         loaded = [read_slam_run(label, folder, truth) for label, folder in members.items()]
         pages.append(slam_page(", ".join(members), loaded, truth))
     return pages

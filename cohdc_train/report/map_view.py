@@ -15,7 +15,7 @@ Image = NDArray[np.uint8]
 _SIDE = 1100  # px of the image's longer side
 _SHORTEST = 0.45  # of the longer side, so that the scale bar has room
 _BORDER = 34  # px
-_ABOVE = 0.4  # m above the cameras from which on points are left out: a ceiling hides the room
+_ABOVE = 0.4  # m above the cameras from which on points are skipped: a ceiling hides the room
 _BACKGROUND, _PATH, _WHITE = (52, 43, 36), (71, 107, 255), (245, 245, 245)  # BGR
 _VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
 

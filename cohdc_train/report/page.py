@@ -39,7 +39,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Picture:
+class EmbeddedImage:
     """An image as a data URL. width, height: px."""
 
     source: str
@@ -60,7 +60,7 @@ class Figure:
     caption: str = ""
     wide: str = ""
     narrow: str = ""
-    picture: Picture | None = None
+    image: EmbeddedImage | None = None
     span: bool = False
     large: bool = False
     chart: bool = False
@@ -68,7 +68,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page with a heading; what is empty is left out.
+    """A part of the page with a heading; what is empty is skipped.
 
     text: sentences below the heading; facts: tiles; folded: tables that are shown on demand;
     divider: whether it opens a part of the page that has sections of its own.

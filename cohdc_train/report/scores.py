@@ -11,9 +11,9 @@ from cohdc_train.report.page import Fact, Figure, Page, Section, Table
 from cohdc_train.report.slam_run import SlamRun, match_to_truth
 from cohdc_train.report.svg import Draw, Size, color, svg
 from cohdc_train.report.tables import mark_best
-from cohdc_train.report.training_run import PICTURES, read_scores, score_files
-from cohdc_train.report.training_sections import picture_figures, score_table
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.report.training_run import VALIDATION_IMAGES, read_scores, score_files
+from cohdc_train.report.training_sections import image_figures, score_table
+from cohdc_train.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -36,7 +36,9 @@ def read_evaluation(label: str, file: Path) -> SlamRun | None:
     estimate, truth = (Path(str(content.get(key))) for key in ("estimate", "groundtruth"))
     if not estimate.is_file():
         return run
-    return match_to_truth(run, read_tum(estimate), read_tum(truth) if truth.is_file() else None)
+    return match_to_truth(
+        run, Trajectory.load_tum(estimate), Trajectory.load_tum(truth) if truth.is_file() else None
+    )
 
 
 def validated_scores(path: Path) -> dict[str, dict[str, float]]:
@@ -54,7 +56,9 @@ def validation_page(title: str, runs: Mapping[str, Path]) -> Page:
     for label, path in runs.items():
         found = validated_scores(path)
         columns |= {label if len(found) == 1 else f"{label}/{n}": s for n, s in found.items()}
-        files += [path / name for name in PICTURES if path.is_dir() and (path / name).is_file()]
+        files += [
+            path / name for name in VALIDATION_IMAGES if path.is_dir() and (path / name).is_file()
+        ]
     facts = []
     if len(columns) == 1:
         (scores,) = columns.values()
@@ -65,7 +69,7 @@ def validation_page(title: str, runs: Mapping[str, Path]) -> Page:
     sections = [
         Section("Scores", tables=[score_table(columns)] if columns else []),
         Section("Classes", tables=_class_table(columns)),
-        Section("Sample predictions", figures=picture_figures(files, len(files))),
+        Section("Sample predictions", figures=image_figures(files, len(files))),
     ]
     return Page(title, "Validation", facts=facts, sections=sections)
 

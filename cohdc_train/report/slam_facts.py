@@ -105,10 +105,14 @@ def _lost_fact(run: SlamRun, lost: int) -> Fact:
 
 
 def _duration(run: SlamRun) -> str:
-    stamps = run.frames.stamps if run.frames is not None else None
-    if stamps is None and run.trajectory is not None:
-        stamps = run.trajectory.stamps
-    return "" if stamps is None or len(stamps) < 2 else f"in {seconds(stamps[-1] - stamps[0])}"
+    timestamps = run.frames.timestamps if run.frames is not None else None
+    if timestamps is None and run.trajectory is not None:
+        timestamps = run.trajectory.timestamps
+    return (
+        ""
+        if timestamps is None or len(timestamps) < 2
+        else f"in {seconds(timestamps[-1] - timestamps[0])}"
+    )
 
 
 def _frames(run: SlamRun) -> tuple[int, int]:
@@ -121,7 +125,7 @@ def where_it_went_wrong(run: SlamRun) -> list[str]:
     """Return sentences on where a run was lost and where it had the fewest inliers."""
     if run.frames is None or not len(run.frames):
         return []
-    times = run.frames.stamps - run.start
+    times = run.frames.timestamps - run.start
     spans = run.frames.lost_spans()
     words = [
         f"{times[first]:.1f} s ({count(last - first + 1, 'frame')})"

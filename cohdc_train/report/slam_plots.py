@@ -95,7 +95,7 @@ def draw_error_path(view: View, run: SlamRun, largest: float) -> Draw:
         errors = run.errors()
         if errors is None or run.matched is None:
             return
-        gaps = run.gaps(run.matched.stamps)
+        gaps = run.gaps(run.matched.timestamps)
         points = np.insert(run.matched.positions, gaps, np.nan, axis=0)[:, [i, j]] * (1, sign)
         pieces, values = _pieces(points, errors[1])
         shades = ListedColormap(colormaps["turbo"](np.linspace(*_SHADES, 256)))
@@ -123,10 +123,10 @@ def draw_errors(runs: Sequence[tuple[int, SlamRun]]) -> Draw:
         for place, run in runs:
             errors = run.errors()
             if errors is not None:
-                stamps, distances = errors
+                timestamps, distances = errors
                 typical.append(float(np.nanmedian(distances)))
                 kept = _thinned(distances, len(runs))
-                times = stamps[kept] - run.start
+                times = timestamps[kept] - run.start
                 axes.plot(times, distances[kept], dash(place), color=color(place), label=run.label)
         if typical and max(typical) > _LOG_FROM * max(min(typical), 1e-6):
             log_scale(axes)
@@ -147,7 +147,7 @@ def draw_strip(run: SlamRun, letters: dict[int, str], scale: StripScale) -> Draw
     frames = run.frames
     if frames is None:
         raise ValueError(f"{run.label}: has no frames to draw")
-    times = frames.stamps - run.start
+    times = frames.timestamps - run.start
     rows: dict[str, _DrawRow] = {"inliers": _draw_inliers}
     if frames.columns["culled_share"].any():
         rows["masked, %"] = _draw_masked

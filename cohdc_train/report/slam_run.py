@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cohdc_train.errors import DataError
 from cohdc_train.trajectory.association import match
 from cohdc_train.trajectory.metrics import align_umeyama
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -28,16 +28,16 @@ _COLUMNS = ("tracked", "keyframe", "inliers", "culled_share", "segment_ms", "tra
 class Frames:
     """Rows of frames.csv, one a frame that was processed.
 
-    names: stamps as text, as the images' names have them; stamps: [n], s; columns: name of the
-    file's column -> [n].
+    names: timestamps as text, as the images' names have them; timestamps: [n], s; columns: name of
+    the file's column -> [n].
     """
 
     names: Sequence[str]
-    stamps: Floats
+    timestamps: Floats
     columns: Mapping[str, Floats]
 
     def __len__(self) -> int:
-        return len(self.stamps)
+        return len(self.timestamps)
 
     @property
     def lost(self) -> NDArray[np.bool_]:
@@ -77,38 +77,38 @@ class SlamRun:
         return self.span()[0]
 
     def span(self) -> tuple[float, float]:
-        """Return the stamps of the first and the last frame, of the poses without frames.csv, s."""
-        stamps = np.zeros(1) if self.trajectory is None else self.trajectory.stamps
+        """Return the times of the first and the last frame, of the poses without frames.csv, s."""
+        timestamps = np.zeros(1) if self.trajectory is None else self.trajectory.timestamps
         if self.frames is not None and len(self.frames):
-            stamps = self.frames.stamps
-        return float(stamps[0]), float(stamps[-1])
+            timestamps = self.frames.timestamps
+        return float(timestamps[0]), float(timestamps[-1])
 
     def errors(self) -> tuple[Floats, Floats] | None:
-        """Return stamps [n], s, and distances to the ground truth [n], m; nan rows at gaps."""
+        """Return timestamps [n], s, and distances to the ground truth [n], m; nan rows at gaps."""
         if self.truth is None or self.matched is None:
             return None
         distances = np.linalg.norm(self.matched.positions - self.truth.positions, axis=1)
-        gaps = self.gaps(self.matched.stamps)
-        return np.insert(self.matched.stamps, gaps, np.nan), np.insert(distances, gaps, np.nan)
+        gaps = self.gaps(self.matched.timestamps)
+        return np.insert(self.matched.timestamps, gaps, np.nan), np.insert(distances, gaps, np.nan)
 
     def path(self) -> tuple[Floats, Floats]:
-        """Return stamps [n] and positions [n, 3], m, with a row of nan wherever tracking paused."""
+        """Return timestamps [n] and positions [n, 3], m, with a row of nan at every gap."""
         if self.trajectory is None:
             return np.zeros(0), np.zeros((0, 3))
-        stamps, positions = self.trajectory.stamps, self.trajectory.positions
-        gaps = self.gaps(stamps)
-        return np.insert(stamps, gaps, np.nan), np.insert(positions, gaps, np.nan, axis=0)
+        timestamps, positions = self.trajectory.timestamps, self.trajectory.positions
+        gaps = self.gaps(timestamps)
+        return np.insert(timestamps, gaps, np.nan), np.insert(positions, gaps, np.nan, axis=0)
 
-    def gaps(self, stamps: Floats) -> NDArray[np.int64]:
+    def gaps(self, timestamps: Floats) -> NDArray[np.int64]:
         """Return indices of poses before which tracking paused."""
-        broken = np.diff(stamps) > _PAUSE_S
+        broken = np.diff(timestamps) > _PAUSE_S
         if self.frames is not None:
-            lost_before = np.searchsorted(self.frames.stamps[self.frames.lost], stamps)
+            lost_before = np.searchsorted(self.frames.timestamps[self.frames.lost], timestamps)
             broken |= np.diff(lost_before) > 0
         return np.flatnonzero(broken) + 1
 
     def length(self) -> float:
-        """Return the length of the tracked path, gaps left out, m."""
+        """Return the length of the tracked path, without the gaps, m."""
         steps = np.linalg.norm(np.diff(self.path()[1], axis=0), axis=1)
         return float(np.nansum(steps))
 
@@ -120,7 +120,7 @@ def read_slam_run(label: str, folder: Path, truth: Trajectory | None) -> SlamRun
     run = SlamRun(label, folder, metrics, config, frames, None, None, None)
     if metrics["coverage"] == 0:  # nothing was tracked: there is no pose
         return run
-    return match_to_truth(run, read_tum(folder / "trajectory.txt"), truth)
+    return match_to_truth(run, Trajectory.load_tum(folder / "trajectory.txt"), truth)
 
 
 def match_to_truth(run: SlamRun, trajectory: Trajectory, truth: Trajectory | None) -> SlamRun:
@@ -132,8 +132,8 @@ def match_to_truth(run: SlamRun, trajectory: Trajectory, truth: Trajectory | Non
     except DataError:  # of another time: the trajectory stands as it is
         return replace(run, trajectory=trajectory)
     T = align_umeyama(matched.positions, matched_truth.positions)
-    moved = trajectory.moved(T)
-    return replace(run, trajectory=moved, truth=matched_truth, matched=matched.moved(T), T=T)
+    moved = trajectory.transformed(T)
+    return replace(run, trajectory=moved, truth=matched_truth, matched=matched.transformed(T), T=T)
 
 
 def find_groundtruth(folder: Path) -> Path | None:
@@ -182,8 +182,8 @@ def _read_frames(file: Path) -> Frames | None:
         if missing := {"stamp", *_COLUMNS} - set(reader.fieldnames or ()):
             raise ValueError(f"no column {min(missing)}")
         names = [row["stamp"] for row in rows]
-        stamps = np.array([float(name) for name in names])
+        timestamps = np.array([float(name) for name in names])
         columns = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise DataError(f"{file}: cannot be read as a table of frames: {error}") from error
-    return Frames(names, stamps, columns)
+    return Frames(names, timestamps, columns)

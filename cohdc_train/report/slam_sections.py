@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from cohdc_train.report import slam_facts
+from cohdc_train.report.images import embed, embed_image
 from cohdc_train.report.map_view import draw_map
 from cohdc_train.report.page import Figure, Page, Section
-from cohdc_train.report.pictures import embed, embed_image
 from cohdc_train.report.slam_plots import (
     CAMERA_VIEWS,
     TRUTH_VIEWS,
@@ -92,7 +92,7 @@ def _during(truth: Trajectory, runs: Sequence[SlamRun]) -> Trajectory:
     """Return the part of the ground truth in which there were frames."""
     spans = [run.span() for run in runs]
     first, last = min(start for start, _ in spans), max(end for _, end in spans)
-    inside = np.flatnonzero((truth.stamps >= first) & (truth.stamps <= last))
+    inside = np.flatnonzero((truth.timestamps >= first) & (truth.timestamps <= last))
     return truth.take(inside) if len(inside) else truth
 
 
@@ -127,13 +127,13 @@ def _strips(runs: Sequence[tuple[int, SlamRun]]) -> list[Section]:
             continue
         worst = _worst_frames(run, _WORST.get(len(runs), 2))
         letters = {index: chr(ord("A") + k) for k, (index, _) in enumerate(worst)}
-        caption = "Red: lost. Ticks: keyframes. Masked: pixels left out. Letters: the images below."
+        caption = "Red: lost. Ticks: keyframes. Masked: pixels not used. Letters: the images below."
         caption = caption if letters else caption.rpartition(" Letters")[0]
         drawing = draw_strip(run, letters, scale)
         strip = _two("Every frame", drawing, _STRIP_WIDE, _STRIP_NARROW, f"strip{place}", caption)
         title = "Where tracking was weak" + (f": {run.label}" if len(runs) > 1 else "")
         images = [
-            Figure(_frame_title(run, index, letters[index]), picture=embed(file, 8 * len(runs)))
+            Figure(_frame_title(run, index, letters[index]), image=embed(file, 8 * len(runs)))
             for index, file in worst
         ]
         pairs = [] if worst else _pairs(run, 8 * len(runs))
@@ -158,7 +158,7 @@ def _worst_frames(run: SlamRun, count: int) -> list[tuple[int, Path]]:
 
 def _frame_title(run: SlamRun, index: int, letter: str) -> str:
     assert run.frames is not None
-    time = run.frames.stamps[index] - run.start
+    time = run.frames.timestamps[index] - run.start
     columns = run.frames.columns
     state = "lost" if run.frames.lost[index] else f"{columns['inliers'][index]:.0f} inliers"
     masked = columns["culled_share"][index]
@@ -172,7 +172,7 @@ def _pairs(run: SlamRun, images: int) -> list[Figure]:
     for kind, what in (("after", "keypoints used, mask outlined"), ("before", "all keypoints")):
         for file in sorted((run.folder / "pictures").glob(f"*_{kind}.jpg"))[:3]:
             title = f"{file.name.removesuffix(f'_{kind}.jpg')}: {what}"
-            figures.append(Figure(title, picture=embed(file, images)))
+            figures.append(Figure(title, image=embed(file, images)))
         if figures:
             break
     return figures
@@ -181,16 +181,16 @@ def _pairs(run: SlamRun, images: int) -> list[Figure]:
 def _maps(runs: Sequence[SlamRun]) -> Section:
     figures = []
     for run in runs:
-        image = draw_map(run)
+        drawn, stored = draw_map(run), run.folder / "map.png"
         name = "Map" if len(runs) == 1 else run.label
-        if image is not None:
-            picture = embed_image(image, 8 * len(runs))
+        if drawn is not None:
+            image = embed_image(drawn, 8 * len(runs))
             caption = "Points of the map; orange: path of the camera, from the white dot."
-            figures.append(Figure(name, caption, picture=picture, large=True))
-        elif (run.folder / "map.png").is_file():
-            picture = embed(run.folder / "map.png", 8 * len(runs))
-            caption = "The camera's path in red."
-            figures.append(Figure(name, caption, picture=picture, large=True))
+        elif stored.is_file():
+            image, caption = embed(stored, 8 * len(runs)), "The camera's path in red."
+        else:
+            continue
+        figures.append(Figure(name, caption, image=image, large=True))
     return Section("Map from above", figures=figures)
 
 

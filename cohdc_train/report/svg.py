@@ -120,8 +120,8 @@ def _settle(figure: "Figure") -> None:
         engine.execute(figure)
     figure.set_layout_engine("none")
     for axes in figure.axes:
-        box = axes.get_position(original=True)
-        axes.set_position([round(float(value), 4) for value in box.bounds])
+        left, bottom, width, height = axes.get_position(original=True).bounds
+        axes.set_position((round(left, 4), round(bottom, 4), round(width, 4), round(height, 4)))
 
 
 def _for_page(text: str) -> str:

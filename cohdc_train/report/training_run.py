@@ -19,7 +19,7 @@ Series = NDArray[np.float64]  # [n, 2]: step and value
 
 _WATCHED = "val/segm_AP"
 _CLASS = "segm_AP/"
-PICTURES = ("best.jpg", "worst.jpg", "pr_curves.png", "calibration.png", "confusion.png")
+VALIDATION_IMAGES = ("best.jpg", "worst.jpg", "pr_curves.png", "calibration.png", "confusion.png")
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class TrainingRun:
             value = value.get(name) if isinstance(value, dict) else None
         return value
 
-    def pictures(self) -> list[Path]:
+    def images(self) -> list[Path]:
         """Return the images of the best validation that are there, of the last one otherwise."""
         for folder in (self.folder / "pictures", self.folder / "pictures" / "last"):
-            files = [folder / name for name in PICTURES if (folder / name).is_file()]
+            files = [folder / name for name in VALIDATION_IMAGES if (folder / name).is_file()]
             if files:
                 return files
         return []

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from cohdc_train.report.images import embed
 from cohdc_train.report.names import count, score_quantity
 from cohdc_train.report.page import Fact, Figure, Page, Section, Table
-from cohdc_train.report.pictures import embed
 from cohdc_train.report.svg import Draw, Size, svg
 from cohdc_train.report.tables import mark_best, options
 from cohdc_train.report.training_plots import (
@@ -66,7 +66,7 @@ def training_sections(runs: Sequence[TrainingRun]) -> list[Section]:
     ]
 
 
-def picture_figures(files: Sequence[Path], images: int) -> list[Figure]:
+def image_figures(files: Sequence[Path], images: int) -> list[Figure]:
     """Return figures of a validation's images, the grids over the whole width.
 
     images: how many the page has.
@@ -75,13 +75,13 @@ def picture_figures(files: Sequence[Path], images: int) -> list[Figure]:
     for file in files:
         title, caption = TITLES.get(file.name, (file.stem, ""))
         grid = file.suffix == ".jpg"
-        figure = Figure(title, caption, picture=embed(file, images), span=grid, chart=not grid)
+        figure = Figure(title, caption, image=embed(file, images), span=grid, chart=not grid)
         figures.append(replace(figure, large=file.name == "pr_curves.png"))
     return figures
 
 
 def score_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
-    """Return a table of segmentation scores, classes left out. columns: head -> scores by name."""
+    """Return a table of segmentation scores, without classes. columns: head -> scores by name."""
     names = sorted({n for scores in columns.values() for n in scores if "/" not in n}, key=_order)
     rows = [
         [
@@ -192,11 +192,11 @@ def _scores(run: TrainingRun) -> Section:
 
 
 def _predictions(run: TrainingRun, runs: int) -> Section:
-    files = run.pictures()
+    files = run.images()
     if runs > 1:  # of several only what is missed is of interest
         files = [file for file in files if file.name == "worst.jpg"]
     title = "Sample predictions" + (f": {run.label}" if runs > 1 else "")
-    return Section(title, figures=picture_figures(files, 6 if runs == 1 else runs))
+    return Section(title, figures=image_figures(files, 6 if runs == 1 else runs))
 
 
 def _plot(drawing: Draw, name: str) -> str:

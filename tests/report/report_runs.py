@@ -12,7 +12,7 @@ import yaml
 
 from cohdc_train.slam.io.ply import write_ply
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 60
 START = 100.0
@@ -87,7 +87,7 @@ def trajectory(noise: float = 0.0, lost: Collection[int] = ()) -> Trajectory:
 def write_truth(folder: Path) -> Path:
     """Write groundtruth.txt into a folder of a sequence."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_tum(folder / "groundtruth.txt", trajectory())
+    trajectory().save_tum(folder / "groundtruth.txt")
     return folder / "groundtruth.txt"
 
 
@@ -102,7 +102,7 @@ def write_slam_run(
     """Write a folder as `cohdc slam` does. worst: indices of frames whose images are stored."""
     (folder / "pictures").mkdir(parents=True)
     estimate = trajectory(noise, lost)
-    write_tum(folder / "trajectory.txt", estimate)
+    estimate.save_tum(folder / "trajectory.txt")
     metrics: dict[str, object] = {
         "seed": 3,
         "realtime": False,

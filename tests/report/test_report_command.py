@@ -11,7 +11,6 @@ from cohdc_train.errors import DataError
 from cohdc_train.report import Table, report
 from cohdc_train.report.command import labels_of
 from cohdc_train.trajectory.evaluate import evaluate
-from cohdc_train.trajectory.trajectory import write_tum
 
 BENCH_ROW = {"name": "HDC-Net", "ap": 0.31, "fps_ort": 12.5, "ap_int8": None, "model_mb": 9.4}
 
@@ -36,7 +35,7 @@ def test_runs_of_different_kinds_have_parts_of_one_page(tmp_path: Path) -> None:
 
 def test_file_of_evaluate_has_its_errors_and_trajectory(tmp_path: Path) -> None:
     truth = write_truth(tmp_path)
-    write_tum(tmp_path / "estimate.txt", trajectory(0.01, range(9)))
+    trajectory(0.01, range(9)).save_tum(tmp_path / "estimate.txt")
     evaluate(truth, tmp_path / "estimate.txt", tmp_path / "scores.json")
     page = Page(report([tmp_path / "scores.json"]).read_text("utf-8"))
     assert {"Trajectory", "Errors"} <= set(page.heads)

@@ -14,7 +14,7 @@ from cohdc_train.report import Table, report, write_report
 from cohdc_train.report.map_view import draw_map, read_points, scale_length
 from cohdc_train.report.slam_plots import _thinned
 from cohdc_train.report.slam_run import find_groundtruth, read_slam_run
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 LOST = range(20, 35)
 
@@ -83,11 +83,11 @@ def test_worst_frames_are_shown_with_letters_in_the_order_of_time(
 
 def test_gap_in_tracking_is_a_gap_in_every_line(tmp_path: Path, truth_file: Path) -> None:
     folder = write_slam_run(tmp_path / "run", lost=(30,))  # one frame: a pause of 0.07 s alone
-    run = read_slam_run("run", folder, read_tum(truth_file))
-    stamps, positions = run.path()
+    run = read_slam_run("run", folder, Trajectory.load_tum(truth_file))
+    timestamps, positions = run.path()
     errors = run.errors()
     assert errors is not None
-    for row in (stamps, positions[:, 0], *errors):
+    for row in (timestamps, positions[:, 0], *errors):
         assert np.flatnonzero(np.isnan(row)).tolist() == [30]
     whole = np.linalg.norm(np.diff(trajectory(0.001).positions, axis=0), axis=1)
     assert run.length() == pytest.approx(whole.sum() - whole[29] - whole[30])

@@ -57,7 +57,7 @@ def test_log_of_a_resumed_training_goes_on(tmp_path: Path) -> None:
     assert run.series["val/segm_AP"][:, 0].tolist() == [9, 19, 29, 39, 49]
 
 
-def test_log_of_another_training_in_the_folder_is_left_out(tmp_path: Path) -> None:
+def test_log_of_another_training_in_the_folder_is_skipped(tmp_path: Path) -> None:
     folder = write_training(tmp_path / "run")
     write_log(folder / "logs" / "version_1" / "metrics.csv", [{"epoch": 0, "step": 9, "a": 1}])
     assert list(read_training_run("run", folder).series) == ["a"]

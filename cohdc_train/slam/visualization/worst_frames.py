@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import fill_mask, write_jpeg
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.slam.visualization.overlays import draw_after, write_jpeg
+from cohdc_train.slam.visualization.overlays import draw_after
 
 _COUNT = 6
 _APART_S = 1.0  # between two of them: a place in which tracking is weak gives one image
-_TINT = np.array((230, 40, 40), np.float32)  # RGB
+_TINT = (230, 40, 40)  # RGB
 _TINT_SHARE = 0.35
 
 
@@ -54,6 +55,5 @@ class WorstFrames:
 def _draw(frame: _WeakFrame) -> NDArray[np.uint8]:
     image = frame.view.rgb.copy()
     mask = np.zeros(image.shape[:2], np.bool_) if frame.mask is None else frame.mask
-    tinted = (1 - _TINT_SHARE) * image[mask] + _TINT_SHARE * _TINT
-    image[mask] = tinted.astype(np.uint8)
+    fill_mask(image, mask, _TINT, _TINT_SHARE)
     return image if frame.features is None else draw_after(image, frame.features, mask)

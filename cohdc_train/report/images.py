@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
-from cohdc_train.report.page import Picture
+from cohdc_train.report.page import EmbeddedImage
 
 PAGE_BYTES = 5_000_000
 IMAGES_BYTES = 2_000_000  # of a page, before base64 makes four bytes of three
@@ -25,8 +25,8 @@ _STEPS = (
 )
 
 
-def embed(file: Path, images: int) -> Picture:
-    """Return an image file as a picture of a page.
+def embed(file: Path, images: int) -> EmbeddedImage:
+    """Return an image file as a image of a page.
 
     images: how many the page has, which share `IMAGES_BYTES`. Raises DataError for a file that is
     no image.
@@ -44,16 +44,16 @@ def embed(file: Path, images: int) -> Picture:
     height, width = image.shape[:2]
     kind = _kind(content)
     if kind and len(content) <= limit and max(height, width) <= _STEPS[0][0]:
-        return Picture(_url(content, kind), width, height)
+        return EmbeddedImage(_url(content, kind), width, height)
     return _smaller(image, limit)
 
 
-def embed_image(image: NDArray[np.uint8], images: int) -> Picture:
-    """Return an image, [H, W, 3] BGR, as a picture of a page that has so many."""
+def embed_image(image: NDArray[np.uint8], images: int) -> EmbeddedImage:
+    """Return an image, [H, W, 3] BGR, as a image of a page that has so many."""
     return _smaller(image, min(_LARGEST, IMAGES_BYTES // max(1, images)))
 
 
-def _smaller(image: NDArray[np.uint8], limit: int) -> Picture:
+def _smaller(image: NDArray[np.uint8], limit: int) -> EmbeddedImage:
     """Return an image as the best JPEG below a limit of bytes, or else as the smallest."""
     content, size = b"", (0, 0)
     for longest, quality in _STEPS:
@@ -64,7 +64,7 @@ def _smaller(image: NDArray[np.uint8], limit: int) -> Picture:
         content = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
         if len(content) <= limit:
             break
-    return Picture(_url(content, "image/jpeg"), *size)
+    return EmbeddedImage(_url(content, "image/jpeg"), *size)
 
 
 def _kind(content: bytes) -> str:
