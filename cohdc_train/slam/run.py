@@ -32,6 +32,7 @@ from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
 from cohdc_train.slam.system import Slam
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
+from cohdc_train.slam.visualization.worst_frames import WorstFrames
 from cohdc_train.trajectory.trajectory import Trajectory
 
 # Options of earlier versions: `cohdc slam` tells their names of today.
@@ -174,7 +175,8 @@ def run_slam(
                 )
             slam_system = _build_slam(source.camera, settings, workers)
             files = stack.enter_context(_map_files(source.camera, part, settings, options))
-            watching: list[RunObserver] = [files, *observers]
+            worst_frames = WorstFrames()
+            watching: list[RunObserver] = [files, worst_frames, *observers]
             if options.viewer or options.rrd is not None:
                 viewer = RerunViewer(source.camera, files.colors, options.viewer, options.rrd)
                 watching.append(stack.enter_context(viewer))
@@ -188,6 +190,7 @@ def run_slam(
                 workers.report_latency(on_pose) if workers else on_pose,
             )
             files.write(slam_system.map, tracked.trajectory)
+            worst_frames.write(part / "pictures")
         metrics: dict[str, Any] = {
             "seed": settings.seed,
             "realtime": options.realtime,
