@@ -212,7 +212,7 @@ def test_a_camera_of_ones_own(tmp_path: Path) -> None:
 
 
 class RealSense(ModuleType):
-    """What docs/live.md uses of pyrealsense2, with a camera that ends after some frames."""
+    """What docs/how-to/live-camera.md uses of pyrealsense2, with a camera that ends after some frames."""
 
     def __init__(self) -> None:
         super().__init__("pyrealsense2")
@@ -250,11 +250,13 @@ class RealSense(ModuleType):
 
 
 def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "how-to" / "live-camera.md").read_text(
+        encoding="utf-8"
+    )
     (example,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     monkeypatch.setitem(sys.modules, "pyrealsense2", RealSense())
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "docs/live.md", "exec"), {})
+    exec(compile(example, "docs/how-to/live-camera.md", "exec"), {})
     metrics = json.loads((tmp_path / "runs" / "realsense" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["coverage"]) == (5, 1.0)
 
