@@ -94,7 +94,9 @@ def known_options() -> set[str]:
     for parser in [*parsers]:
         parsers += option_reference.subcommands(parser).values()
     for parser in parsers:
-        known |= {name for action in parser._actions for name in action.option_strings}
+        # A group's own option takes a file, and is no option of a user.
+        single = [a for a in parser._actions if type(a).__name__ != "_ActionConfigLoad"]
+        known |= {name for action in single for name in action.option_strings}
     return known
 
 

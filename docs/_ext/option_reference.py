@@ -13,7 +13,7 @@ from unittest import mock
 
 import jsonargparse
 
-from cohdc_train import __all__ as PUBLIC_NAMES
+import cohdc_train
 from cohdc_train.cli import VERBS, main
 
 FOREIGN_GROUPS = ("trainer", "checkpoint")  # groups that Lightning defines and documents
@@ -179,14 +179,12 @@ def options_index() -> str:
 
 def api_page() -> str:
     """Return the page of the public Python names."""
-    import cohdc_train
-
     parts = [
         "# Python",
         "These names are the public interface: `from cohdc_train import Segmenter`. "
         "They load when they are used, so `import cohdc_train` needs no torch.",
     ]
-    for name in sorted(set(PUBLIC_NAMES) - {"__version__"}, key=str.lower):
+    for name in sorted(set(cohdc_train.__all__) - {"__version__"}, key=str.lower):
         directive = "autoclass" if isinstance(getattr(cohdc_train, name), type) else "autofunction"
         members = "   :members:\n" if directive == "autoclass" else ""
         parts.append(f"## {name}")
