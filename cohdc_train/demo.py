@@ -191,13 +191,13 @@ def _train(out: Path, plan: Plan, seed: int) -> dict[str, float]:
     ]
     if subprocess.run(fit, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode != 0:
         raise CohdcError("the training ended early; its own message stands above")
-    return validate(out / "train" / "best.ckpt", out / "data", out / "train" / "scores.json")
+    return validate(out / "train" / "best.ckpt", out / "data", out=out / "train" / "scores.json")
 
 
 def _export(out: Path) -> None:
     from cohdc_train.exporter.export import export
 
-    export(out / "train" / "best.ckpt", out / "model.onnx", out / "data" / "images")
+    export(out / "train" / "best.ckpt", out / "model.onnx", images=out / "data" / "images")
 
 
 def _slam(sequence: Path, out: Path, model: Path | None, seed: int) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
-from cohdc_train.cli import VERBS, main
+from cohdc_train.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -76,7 +76,7 @@ def silenced(component: Any) -> Any:
 
 def check(words: list[str]) -> int:
     """Give a command to `cohdc` without running its verb; returns the exit code."""
-    verb = VERBS.get(words[0]) if words else None
+    verb = COMMANDS.get(words[0]) if words else None
     if verb is None:
         return main(words)
     module = importlib.import_module(f"cohdc_train.{verb.module}")

@@ -16,7 +16,7 @@ from plane_world import write_sequence
 from test_segmenter_foreign import candidate, columns, yolo
 
 from cohdc_train import signature
-from cohdc_train.cli import VERBS, main
+from cohdc_train.cli import COMMANDS, main
 from cohdc_train.presets import config_path, model_path
 
 sys.path.insert(0, str(DOCS / "_ext"))
@@ -50,10 +50,10 @@ def command_lines(pages: list[Path]) -> list[tuple[str, ...]]:
 
 
 # The recipes add what their commands need; test_recipes.py runs those.
-COMMANDS = command_lines([page for page in GUIDES if page.parts[0] != "recipes"])
+GUIDE_COMMANDS = command_lines([page for page in GUIDES if page.parts[0] != "recipes"])
 
 
-@pytest.mark.parametrize("words", [w for w in COMMANDS if w[0] != "fit"], ids=" ".join)
+@pytest.mark.parametrize("words", [w for w in GUIDE_COMMANDS if w[0] != "fit"], ids=" ".join)
 def test_command_of_a_guide_parses(words: tuple[str, ...]) -> None:
     assert check(list(words)) == 0
 
@@ -77,7 +77,7 @@ def fit_parser() -> object:
     return option_reference.parser_of("fit")
 
 
-@pytest.mark.parametrize("words", [w for w in COMMANDS if w[0] == "fit"], ids=" ".join)
+@pytest.mark.parametrize("words", [w for w in GUIDE_COMMANDS if w[0] == "fit"], ids=" ".join)
 def test_fit_command_of_a_guide_parses(words: tuple[str, ...], fit_parser: object) -> None:
     arguments = list(words[1:])
     while arguments and not arguments[0].startswith("-"):
@@ -90,7 +90,7 @@ def test_fit_command_of_a_guide_parses(words: tuple[str, ...], fit_parser: objec
 def known_options() -> set[str]:
     """Return every option of every verb."""
     known = {"--help", "--version", "--no"}
-    parsers = [option_reference.parser_of(verb) for verb in VERBS]
+    parsers = [option_reference.parser_of(verb) for verb in COMMANDS]
     for parser in [*parsers]:
         parsers += option_reference.subcommands(parser).values()
     for parser in parsers:
@@ -103,7 +103,7 @@ def known_options() -> set[str]:
 # Options of other programs that pages speak of.
 OTHER_PROGRAMS = {
     *("--master_addr", "--master_port", "--nnodes", "--node_rank", "--nproc_per_node"),
-    *("--ntasks-per-node", "--nodes", "--signal", "--shm-size", "--user", "--side", "--platform"),
+    *("--ntasks-per-node", "--nodes", "--signal", "--shm-size", "--user", "--platform"),
 }
 
 
@@ -252,7 +252,7 @@ def test_contract_page_names_every_tensor_and_key() -> None:
 
 
 def test_option_pages_hold_every_option_of_every_verb() -> None:
-    for verb in VERBS:
+    for verb in COMMANDS:
         text = option_reference.verb_page(verb)
         parser = option_reference.parser_of(verb)
         for member in option_reference.subcommands(parser).values() or [parser]:

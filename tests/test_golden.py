@@ -1,4 +1,4 @@
-"""tools/experiments/golden.py: what it takes for equal, and what for different."""
+"""tools/experiments/golden.py: which results count as equal, and which as different."""
 
 import json
 from collections.abc import Callable
@@ -18,7 +18,7 @@ def compare() -> ModuleType:
 
 @pytest.fixture
 def folders(tmp_path: Path) -> Folders:
-    """Two runs that differ in times, in the version, and in nothing else."""
+    """Write two runs that differ in times and version only."""
     for name, seconds in (("base", 1.25), ("head", 9.75)):
         write_run(tmp_path / name, seconds)
     return tmp_path / "base", tmp_path / "head"

@@ -1,4 +1,4 @@
-"""What a user gets: the built wheel in a clean environment, and the Dockerfiles."""
+"""Packaging: the built wheel in a clean environment, and the Dockerfiles."""
 
 import json
 import os
@@ -16,14 +16,14 @@ import pytest
 import yaml
 from tool_loader import load_tool
 
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCKERFILES = sorted((ROOT / "docker").glob("*.Dockerfile"))
 
 
 def draw_sequence(folder: Path, frames: int = 12) -> None:
-    """A TUM folder of a camera that glides past a textured wall 2 m away, 3 cm a frame."""
+    """Write a TUM folder of a camera that glides past a textured wall 2 m away, 3 cm a frame."""
     size, focal, depth_m, step = (240, 320), 260.0, 2.0, 0.03
     rng = np.random.default_rng(0)
     wall = cv2.GaussianBlur(rng.integers(0, 256, (240, 480), np.uint8), (0, 0), 1.5)
@@ -54,11 +54,11 @@ def draw_sequence(folder: Path, frames: int = 12) -> None:
         "depth_scale": 5000,
     }
     (folder / "camera.yaml").write_text(json.dumps(camera))  # JSON is YAML
-    write_tum(folder / "groundtruth.txt", Trajectory(np.arange(frames) / 30, poses))
+    Trajectory(np.arange(frames) / 30, poses).save_tum(folder / "groundtruth.txt")
 
 
 class Clean:
-    """A fresh environment, used from a folder that is not the repository."""
+    """Fresh environment, used from a folder outside the repository."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -107,7 +107,7 @@ def test_wheel_runs_outside_the_repository_without_torch(clean: Clean) -> None:
     where, torch = clean.run("python", "-c", code).split()
     assert Path(where).is_relative_to(clean.folder)
     assert torch == "None"
-    assert "no fault found" in clean.run("cohdc", "env")
+    assert "no problem found" in clean.run("cohdc", "env")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""`from cohdc_train import ...`: every name loads, and those of the robot load no torch."""
+"""Public API: all names load, and those of the robot load no torch."""
 
 import subprocess
 import sys
@@ -11,7 +11,11 @@ import cohdc_train
 
 WITH_TORCH = {"export", "fit", "validate"}
 NAMES = sorted(set(cohdc_train.__all__) - {"__version__"})
-CODE = "import sys, cohdc_train; cohdc_train.{name}; print('torch' in sys.modules, 'numpy' in sys.modules)"
+CODE = """
+import sys, cohdc_train
+cohdc_train.{name}
+print("torch" in sys.modules, "numpy" in sys.modules)
+"""
 TINY = {
     "data.canvas": [48, 64],
     "data.workers": 0,

@@ -1,4 +1,4 @@
-"""What README says can be done: its commands parse, its links lead somewhere."""
+"""README: its commands parse, its links lead to files."""
 
 import re
 import subprocess
@@ -11,12 +11,12 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 LIGHTNING = ("fit",)  # Lightning parses it by itself
 
 
-COMMANDS = commands(README)
+README_COMMANDS = commands(README)
 
 
 @pytest.mark.parametrize(
     "words",
-    [words for words in COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
+    [words for words in README_COMMANDS if words[:1] not in [[v] for v in LIGHTNING]],
     ids=" ".join,
 )
 def test_command_parses(words: list[str]) -> None:
@@ -25,7 +25,9 @@ def test_command_parses(words: list[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [words for words in COMMANDS if words[:1] in [[v] for v in LIGHTNING]], ids=" ".join
+    "words",
+    [words for words in README_COMMANDS if words[:1] in [[v] for v in LIGHTNING]],
+    ids=" ".join,
 )
 def test_training_command_parses(words: list[str]) -> None:
     done = subprocess.run(

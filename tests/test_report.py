@@ -12,7 +12,7 @@ import pytest
 from cohdc_train.errors import DataError
 from cohdc_train.report import Table, report, write_report
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 
 class Page(HTMLParser):
@@ -55,7 +55,7 @@ def trajectory(noise: float = 0.0, n: int = 60) -> Trajectory:
 def run_folder(folder: Path, noise: float, pictures: bool = True) -> Path:
     (folder / "pictures").mkdir(parents=True)
     estimate = trajectory(noise)
-    write_tum(folder / "trajectory.txt", estimate)
+    estimate.save_tum(folder / "trajectory.txt")
     metrics = {"coverage": 1.0, "frames": 60, "ms": {"track": {"p50": 11.25, "p95": 20.5}}}
     (folder / "metrics.json").write_text(json.dumps({**metrics, **score(trajectory(), estimate)}))
     for kind in ("before", "after") if pictures else ("before",):
@@ -67,7 +67,7 @@ def run_folder(folder: Path, noise: float, pictures: bool = True) -> Path:
 
 @pytest.fixture
 def truth_file(tmp_path: Path) -> Path:
-    write_tum(tmp_path / "groundtruth.txt", trajectory())
+    trajectory().save_tum(tmp_path / "groundtruth.txt")
     return tmp_path / "groundtruth.txt"
 
 
@@ -149,7 +149,7 @@ def test_uneven_table_is_refused() -> None:
 
 def test_the_verb_finds_the_ground_truth_of_the_run_and_compares(tmp_path: Path) -> None:
     (tmp_path / "sequence").mkdir()
-    write_tum(tmp_path / "sequence" / "groundtruth.txt", trajectory())
+    trajectory().save_tum(tmp_path / "sequence" / "groundtruth.txt")
     ours, other = run_folder(tmp_path / "with", 0.001), run_folder(tmp_path / "without", 0.1)
     (ours / "config.yaml").write_text(f"sequence: {tmp_path / 'sequence'}")
     assert report(ours, against=other) == ours / "report.html"

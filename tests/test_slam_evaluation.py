@@ -1,6 +1,4 @@
-"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, and tells what it
-found.
-"""
+"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, reports."""
 
 import json
 import sys

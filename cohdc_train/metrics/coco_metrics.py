@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cohdc_train.masks import roi_window
 from cohdc_train.metrics.rle import boundary_rle, to_rle, window_boundary, window_rle
+from cohdc_train.types import Row
 
 MATCH_IOU = 0.5  # mask IoU from which a detection counts as having found an object
 HIGH_QUALITY = 0.9  # S > 90
@@ -24,7 +25,6 @@ IOUS = np.linspace(0.5, 0.95, 10)  # COCO's thresholds
 RECALLS = np.linspace(0.0, 1.0, 101)  # COCO's recalls, at which it takes the precision
 _MAX_DETECTIONS = 100  # per image, COCO's
 
-Row = dict[str, Any]
 Kind = Literal["segm", "boundary", "bbox"]
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as rle
 
-from cohdc_train.metrics.coco_metrics import CERTAIN, MATCH_IOU, Results, Row
+from cohdc_train.metrics.coco_metrics import CERTAIN, MATCH_IOU, Results
 from cohdc_train.metrics.rle import to_rle
+from cohdc_train.types import Row
 
 
 @dataclass(frozen=True)

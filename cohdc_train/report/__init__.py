@@ -18,7 +18,7 @@ from cohdc_train.files import check_folder, list_files, write_text
 from cohdc_train.report.plots import Run, plot_errors, plot_over_time, plot_paths
 from cohdc_train.trajectory.association import match
 from cohdc_train.trajectory.metrics import align_umeyama
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,7 +127,7 @@ def write_report(
     overlays: JPEG or PNG images of predicted masks; tables: shown first. Sections without content
     are left out. Raises DataError naming a file of a run or an image that cannot be used.
     """
-    truth = None if groundtruth is None else read_tum(groundtruth)
+    truth = None if groundtruth is None else Trajectory.load_tum(groundtruth)
     loaded = [_load(label, folder, truth) for label, folder in runs.items()]
     parts = [table.html() for table in (*tables, *_metric_tables(loaded))]
     aligned = [run for run in loaded if run.estimate is not None]
@@ -185,7 +185,7 @@ def _load(label: str, folder: Path, truth: Trajectory | None) -> Run:
         raise DataError(f"{file}: cannot be read as metrics: {error!r}") from error
     if metrics.get("coverage") == 0:  # a tracker that was never on its way has no pose to plot
         return Run(label, folder, metrics, None, None)
-    estimate = read_tum(folder / "trajectory.txt")
+    estimate = Trajectory.load_tum(folder / "trajectory.txt")
     if truth is None:
         return Run(label, folder, metrics, None, estimate)
     try:
@@ -193,7 +193,7 @@ def _load(label: str, folder: Path, truth: Trajectory | None) -> Run:
     except DataError:
         return Run(label, folder, metrics, None, None)
     T = align_umeyama(matched.positions, matched_truth.positions)
-    return Run(label, folder, metrics, matched_truth, matched.moved(T))
+    return Run(label, folder, metrics, matched_truth, matched.transformed(T))
 
 
 # ---- tables

@@ -42,8 +42,8 @@ def _opened(trajectory: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.flo
     """Stamps [n] and positions [n, 3] with a row of nan wherever tracking paused, so that no line
     is drawn there.
     """
-    pauses = np.flatnonzero(np.diff(trajectory.stamps) > _LOST_AFTER_S) + 1
-    stamps = np.insert(trajectory.stamps, pauses, np.nan)
+    pauses = np.flatnonzero(np.diff(trajectory.timestamps) > _LOST_AFTER_S) + 1
+    stamps = np.insert(trajectory.timestamps, pauses, np.nan)
     return stamps, np.insert(trajectory.positions, pauses, np.nan, axis=0)
 
 
@@ -73,7 +73,7 @@ def plot_paths(truth: Trajectory | None, runs: Sequence[Run]) -> "Figure":
 def plot_over_time(truth: Trajectory | None, runs: Sequence[Run]) -> "Figure":
     """x, y and z, m, over s since the first pose."""
     figure = _figure(11, 6)
-    start = _lines(truth, runs)[0][1].stamps[0]
+    start = _lines(truth, runs)[0][1].timestamps[0]
     rows = figure.subplots(3, 1, sharex=True)
     for k, axes in enumerate(rows):
         for label, trajectory, colour in _lines(truth, runs):
@@ -96,7 +96,7 @@ def plot_errors(truth: Trajectory, runs: Sequence[Run]) -> "Figure":
         errors = np.linalg.norm(run.estimate.positions - run.truth.positions, axis=1)
         label = f"{run.label}: rmse {np.sqrt(np.mean(errors**2)):.4f} m"
         axes.plot(
-            run.truth.stamps - truth.stamps[0],
+            run.truth.timestamps - truth.timestamps[0],
             np.maximum(errors, 1e-5),
             ".-",
             color=colour,

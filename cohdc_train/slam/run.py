@@ -25,7 +25,7 @@ from cohdc_train.slam.runtime.workers import workers
 from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import Viewer
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 
 def slam(
@@ -122,7 +122,7 @@ def run_source(
     """
     _check_options(out, cloud, model, masks, seed, features)
     culling, method = culling or Culling(), method or Method()
-    truth = None if source.groundtruth is None else read_tum(source.groundtruth)
+    truth = None if source.groundtruth is None else Trajectory.load_tum(source.groundtruth)
     maker = _masks(model, masks, source.camera, culling, 1 if realtime else 0)
     options = {
         "model": model,

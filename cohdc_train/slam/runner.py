@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import write_jpeg
 from cohdc_train.errors import DataError
 from cohdc_train.slam.dynamics.mask_sources import MaskSource
 from cohdc_train.slam.features.keypoints import Features
@@ -17,7 +18,7 @@ from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameRecord, PoseCallback, View
 from cohdc_train.slam.io.sources import Source
 from cohdc_train.slam.tracking.tracker import Tracker
-from cohdc_train.slam.visualization.overlays import draw_after, draw_before, write_jpeg
+from cohdc_train.slam.visualization.overlays import draw_after, draw_before
 
 
 class RunObserver(Protocol):

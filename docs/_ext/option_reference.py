@@ -14,7 +14,7 @@ from unittest import mock
 import jsonargparse
 
 import cohdc_train
-from cohdc_train.cli import VERBS, main
+from cohdc_train.cli import COMMANDS, main
 
 FOREIGN_GROUPS = ("trainer", "checkpoint")  # groups that Lightning defines and documents
 
@@ -151,7 +151,7 @@ def group_pages(parser: jsonargparse.ArgumentParser, level: int) -> Iterator[str
 def verb_page(verb: str) -> str:
     """Return the page of one verb."""
     parser = parser_of(verb)
-    parts = [f"# cohdc {verb}", sentence(plain(VERBS[verb].summary))]
+    parts = [f"# cohdc {verb}", sentence(plain(COMMANDS[verb].summary))]
     members = subcommands(parser)
     if not members:
         parts += group_pages(parser, 2)
@@ -165,9 +165,11 @@ def verb_page(verb: str) -> str:
 
 def options_index() -> str:
     """Return the page that lists the verbs."""
-    rows = [f"| [`cohdc {verb}`]({verb}.md) | {plain(VERBS[verb].summary)} |" for verb in VERBS]
+    rows = [
+        f"| [`cohdc {verb}`]({verb}.md) | {plain(COMMANDS[verb].summary)} |" for verb in COMMANDS
+    ]
     table = "\n".join(["| verb | what it does |", "|---|---|", *rows])
-    toctree = "\n".join(["```{toctree}", ":hidden:", "", *VERBS, "```"])
+    toctree = "\n".join(["```{toctree}", ":hidden:", "", *COMMANDS, "```"])
     text = (
         "Every option of every verb, with its help and its default. These pages are generated "
         "from the parsers when the site is built.\n\n"
@@ -202,7 +204,7 @@ def write_if_changed(path: Path, text: str) -> None:
 def write_pages(app: Any) -> None:
     """Write all generated pages below docs/reference/."""
     folder = Path(app.srcdir) / "reference"
-    pages = {f"{verb}.md": verb_page(verb) for verb in VERBS}
+    pages = {f"{verb}.md": verb_page(verb) for verb in COMMANDS}
     pages["index.md"] = options_index()
     for stale in (folder / "options").glob("*.md"):
         if stale.name not in pages:

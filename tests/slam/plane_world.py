@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import exp_se3
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
 CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\ndepth_scale: 5000\n"
@@ -171,5 +171,5 @@ def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> P
         (folder / f"{name}.txt").write_text("# stamp file\n" + "\n".join(lines) + "\n")
     (folder / "camera.yaml").write_text(CAMERA_YAML)
     stamps = np.array([float(line.split()[0]) for line in rows["rgb"]])
-    write_tum(folder / "groundtruth.txt", Trajectory(stamps, poses))
+    Trajectory(stamps, poses).save_tum(folder / "groundtruth.txt")
     return folder

@@ -23,7 +23,7 @@ from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded
 from cohdc_train.slam.run import run_source, slam
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 SIX = {"rmse", "mean", "median", "std", "min", "max"}
 FRAMES = 36
@@ -71,8 +71,11 @@ def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequenc
     tables = {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", MANIFEST}
     assert names == tables | {"map.ply", "map.png", "pictures"}
     assert [path.name for path in masked.parent.iterdir()] == ["run"], "no temporary folder is left"
-    trajectory, truth = read_tum(masked / "trajectory.txt"), read_tum(sequence / "groundtruth.txt")
-    np.testing.assert_array_equal(trajectory.stamps, truth.stamps)
+    trajectory, truth = (
+        Trajectory.load_tum(masked / "trajectory.txt"),
+        Trajectory.load_tum(sequence / "groundtruth.txt"),
+    )
+    np.testing.assert_array_equal(trajectory.timestamps, truth.timestamps)
     with (masked / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == FRAMES

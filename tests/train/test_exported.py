@@ -10,7 +10,7 @@ import torch
 from cohdc_train.errors import CohdcError
 from cohdc_train.exporter.graph import write_graph
 from cohdc_train.exporter.quantization import quantize
-from cohdc_train.exporter.sample_images import drawn_images
+from cohdc_train.exporter.sample_images import draw_samples
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
 from cohdc_train.models.frozen_norm import FrozenNorm
 from cohdc_train.train.module import MaskRCNNModule
@@ -18,7 +18,7 @@ from cohdc_train.train.module import MaskRCNNModule
 pytestmark = pytest.mark.filterwarnings(
     "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
 )
-IMAGE = torch.from_numpy(drawn_images(1)[0]).permute(2, 0, 1)
+IMAGE = torch.from_numpy(draw_samples(1)[0]).permute(2, 0, 1)
 
 
 def trained(config: NetworkConfig) -> MaskRCNN:
@@ -76,7 +76,7 @@ def test_quantised_weights_come_back_within_their_step(
     network: MaskRCNN, file: Path, tmp_path: Path
 ) -> None:
     small = tmp_path / "model.int8.onnx"
-    quantize(file, small, drawn_images(2))
+    quantize(file, small, draw_samples(2))
     exact, rounded = (module_of(network.config, ["person", "car"]) for _ in range(2))
     exact.take_over(file)
     assert rounded.take_over(small) == []

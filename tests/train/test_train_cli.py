@@ -398,7 +398,7 @@ def test_validate_keeps_pictures_it_did_not_write(
     toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "best.jpg").write_text("mine")
-    assert main(["validate", "person", str(toy), f"--pictures={tmp_path}"]) == 1
+    assert main(["validate", "person", str(toy), f"--figures={tmp_path}"]) == 1
     assert "holds best.jpg, not written by a former cohdc validate" in capsys.readouterr().err
     assert (tmp_path / "best.jpg").read_text() == "mine"
 

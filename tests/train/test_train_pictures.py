@@ -229,7 +229,7 @@ def test_a_fit_and_a_validation_leave_their_pictures(
                 str(run / "best.ckpt"),
                 str(toy),
                 "--workers=0",
-                f"--pictures={toy / 'new' / 'p'}",
+                f"--figures={toy / 'new' / 'p'}",
             ]
         )
         == 0

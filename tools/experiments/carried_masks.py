@@ -21,9 +21,9 @@ from cohdc_train.files import write_json, write_text
 from cohdc_train.slam.config import Culling
 from cohdc_train.slam.dynamics.mask_propagation import Half, Propagation, halve, halve_mask
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded
+from cohdc_train.types import Mask
 
 
 def halves(folder: Path) -> list[tuple[Half, Mask]]:

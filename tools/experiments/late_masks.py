@@ -25,7 +25,7 @@ from cohdc_train.segmenter import Segmenter
 from cohdc_train.slam.config import Culling, Method
 from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import grow
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.io.sources import Recorded, rgbd_layout
@@ -34,7 +34,8 @@ from cohdc_train.slam.runtime.executors import SynchronousExecutor
 from cohdc_train.slam.runtime.threads import one_thread
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import Mask
 
 
 class LateMasks:
@@ -97,9 +98,9 @@ def error(source: Recorded, masks: Callable[[View], Mask], features: int, method
             tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
         tracker.finish()
     assert source.groundtruth is not None
-    rmse: float = score(read_tum(source.groundtruth), Trajectory(*tracker.trajectory()))["ate_m"][
-        "rmse"
-    ]
+    rmse: float = score(Trajectory.load_tum(source.groundtruth), Trajectory(*tracker.trajectory()))[
+        "ate_m"
+    ]["rmse"]
     return rmse
 
 

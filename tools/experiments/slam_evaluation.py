@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""Dynamic SLAM scored on rendered sequences whose truth is exact: walks, carts, crowds, a loop,
-plain walls and more.
+"""Dynamic SLAM scored on rendered sequences with exact ground truth.
 
     tools/experiments/slam_evaluation.py --root DIR --out OUT [--model person] [--seeds 0 1 2]
         [--method loops=false ...]
@@ -30,7 +29,7 @@ from cohdc_train.files import sha256, write_json, write_text
 from cohdc_train.presets import model_path
 from cohdc_train.slam.run import slam
 from cohdc_train.synth.camera_motion import CameraMotion
-from cohdc_train.synth.scenario import Setting
+from cohdc_train.synth.scenario import SceneConfig
 from cohdc_train.synth.sequence import sequence
 
 Row = dict[str, Any]
@@ -45,19 +44,19 @@ class Kind:
     seed: int
     motion: CameraMotion
     people: int
-    scene: Setting = Setting()  # noqa: RUF009 - frozen
+    scene: SceneConfig = SceneConfig()  # noqa: RUF009 - frozen
     length: int = 1
 
 
 KINDS = {
-    "rolling_cart": Kind(101, "xyz", 0, Setting(cart="alone")),
-    "pushed_cart": Kind(102, "halfsphere", 2, Setting(cart="pushed")),
+    "rolling_cart": Kind(101, "xyz", 0, SceneConfig(cart="alone")),
+    "pushed_cart": Kind(102, "halfsphere", 2, SceneConfig(cart="pushed")),
     "loop": Kind(103, "loop", 2, length=2),
     "crowd": Kind(104, "xyz", 9),
-    "plain_wall": Kind(105, "xyz", 2, Setting(walls="plain")),
-    "filled_view": Kind(106, "xyz", 3, Setting(action="fill_view")),
-    "stop_and_go": Kind(107, "halfsphere", 3, Setting(action="stop_and_go")),
-    "sitting": Kind(108, "halfsphere", 3, Setting(action="sit")),
+    "plain_wall": Kind(105, "xyz", 2, SceneConfig(walls="plain")),
+    "filled_view": Kind(106, "xyz", 3, SceneConfig(action="fill_view")),
+    "stop_and_go": Kind(107, "halfsphere", 3, SceneConfig(action="stop_and_go")),
+    "sitting": Kind(108, "halfsphere", 3, SceneConfig(action="sit")),
     "walking_xyz": Kind(109, "xyz", 3),
     "walking_halfsphere": Kind(110, "halfsphere", 3),
     "walking_static": Kind(111, "static", 3),
@@ -98,7 +97,10 @@ def main() -> None:
 
 
 def parse() -> argparse.Namespace:
-    """The arguments; `method` is a Method, `modes` those that can run."""
+    """Read the command line.
+
+    `method` becomes a Method, `modes` those that can run.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -132,18 +134,18 @@ def parse() -> argparse.Namespace:
 
 
 def digest(files: Iterable[Path]) -> str:
-    """Of the tracker's code: rows of other code are not this code's."""
+    """Compute a digest of the tracker's code: rows of other code are not reused."""
     return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(files))).hexdigest()[:16]
 
 
 def kept(path: Path, code: str) -> list[Row]:
-    """Rows of former calls that this code made."""
+    """Read the rows of former calls that this code made."""
     rows = json.loads(path.read_text()) if path.is_file() else []
     return [row for row in rows if row["code"] == code]
 
 
 def render(folder: Path, kind: Kind, frames: int, size: tuple[int, int]) -> None:
-    """Render a sequence unless it lies there. Raises SystemExit when another one does."""
+    """Render a sequence unless it exists. Raises SystemExit when another one does."""
     wanted = {
         "seed": kind.seed,
         "motion": kind.motion,
@@ -175,8 +177,9 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
 
 
 def tables(rows: list[Row]) -> str:
-    """A table per method: ATE RMSE of every sequence and mode, median and worst over the seeds, and
-    coverage.
+    """Format a table per method: ATE RMSE of all sequences and modes, and coverage.
+
+    Median and worst over the seeds.
     """
     parts = []
     for method in unique(json.dumps(row["method"]) for row in rows):
@@ -198,7 +201,7 @@ def tables(rows: list[Row]) -> str:
 
 
 def cell(rows: list[Row]) -> str:
-    """What one mode did on one sequence."""
+    """Format the result of one mode on one sequence."""
     if not rows:
         return "-"
     known = [row["ate_m"] for row in rows if row["ate_m"] is not None]
@@ -207,7 +210,7 @@ def cell(rows: list[Row]) -> str:
 
 
 def unique(names: Iterable[str]) -> list[str]:
-    """In the order of their first appearance."""
+    """List distinct values in the order of their first appearance."""
     return list(dict.fromkeys(names))
 
 

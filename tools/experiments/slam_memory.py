@@ -9,7 +9,7 @@ Frames come at 30 a second, images a --shrink-th as wide and high; they are read
 A line every --every frames: resident memory beyond that before the first frame, keyframes and
 points the map holds, keyframes made since the line before, and CPU time per frame. Results go to
 OUT as `cohdc slam` writes them; the truth goes forth and back, too. Rolling shutter and the time
-between colour and depth are left out, for they would be wrong on the way back.
+between color and depth are skipped, as they would be wrong on the way back.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from cohdc_train.slam.io.sources import Recorded
 from cohdc_train.slam.run import run_source
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.association import associate
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 RATE = 30  # frames per second
 
@@ -76,9 +76,8 @@ class ForthAndBack:
         self.groundtruth: Path | None = None
         if recorded.groundtruth is not None:
             self.groundtruth = out / "groundtruth.txt"
-            write_tum(
-                self.groundtruth, self._truth(read_tum(recorded.groundtruth), np.array(stamps))
-            )
+            truth = Trajectory.load_tum(recorded.groundtruth)
+            self._truth(truth, np.array(stamps)).save_tum(self.groundtruth)
 
     def __len__(self) -> int:
         return len(self._order)
@@ -97,7 +96,7 @@ class ForthAndBack:
 
     def _truth(self, truth: Trajectory, stamps: np.ndarray) -> Trajectory:
         """The pose nearest in time to every image, at the times they are played."""
-        row = dict(associate(stamps, truth.stamps, 0.02).tolist())
+        row = dict(associate(stamps, truth.timestamps, 0.02).tolist())
         known = [
             (number / RATE, row[place]) for number, place in enumerate(self._order) if place in row
         ]
@@ -114,7 +113,7 @@ def shrunk(camera: Camera, by: int) -> Camera:
 
 
 def small(view: View, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, and depth as it is stored."""
+    """Color, and depth as it is stored."""
     rgb = cv2.resize(view.rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return rgb, np.rint(view.depth[by // 2 :: by, by // 2 :: by] * camera.depth_scale).astype(
         np.uint16

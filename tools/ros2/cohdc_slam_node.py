@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A ROS 2 node around the SLAM runner: colour and aligned depth in; pose, path and mask out.
+"""A ROS 2 node around the SLAM runner: color and aligned depth in; pose, path and mask out.
 
     tools/ros2/cohdc_slam_node.py --ros-args -p model:=person -p out:=runs/robot \
         -r color/image:=/camera/color/image_raw -r color/camera_info:=/camera/color/camera_info \
@@ -41,7 +41,7 @@ from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, r
 from cohdc_train.slam.run import run_source
 from cohdc_train.slam.tracking.tracker import Tracker
 
-SLOP = 0.02  # s between the stamps of colour and depth
+SLOP = 0.02  # s between the stamps of color and depth
 WAIT = 0.2  # s between two looks at whether to stop
 
 

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.free_space import DepthComparison, FreeSpaceChecker, Reference
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import grow
 from cohdc_train.slam.dynamics.moving_surfaces import MovingSurfaceTracker
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
+from cohdc_train.types import Mask
 
 _REFERENCES = 8  # keyframes whose depth a frame is held against
 _BAND = 8.0  # px: a coarse pixel's width, around what depth finds

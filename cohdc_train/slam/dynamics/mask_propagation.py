@@ -19,10 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import grow
 from cohdc_train.slam.frame import View
-
-Floats = NDArray[np.float32]
+from cohdc_train.types import Float32Array, Mask
 
 _GATE = 0.3  # m: what moves from one frame to the next keeps its depth
 _BAND = 2  # px of half size: how far one step may move the mask's edge to where depth breaks
@@ -35,10 +34,10 @@ class Half:
     """A frame at half size. gray: [h, w] uint8; depth: [h, w] m, 0 = no reading."""
 
     gray: NDArray[np.uint8]
-    depth: Floats
+    depth: Float32Array
 
 
-def halve(rgb: NDArray[np.uint8], depth: Floats) -> Half:
+def halve(rgb: NDArray[np.uint8], depth: Float32Array) -> Half:
     """rgb: [H, W, 3]; depth: [H, W] m, of which every second reading is taken: a mean would mix
     near and far.
     """
@@ -68,10 +67,10 @@ class Propagation:
     def __init__(self) -> None:
         # Any: OpenCV's stubs do not know that the flow to start from may be None.
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-        self._frames: deque[tuple[int, Half, Floats]] = deque(
+        self._frames: deque[tuple[int, Half, Float32Array]] = deque(
             maxlen=_HISTORY
         )  # number, frame, places in the one before
-        self._grid: Floats | None = None
+        self._grid: Float32Array | None = None
         self._mask: Mask | None = None
         self._number = 0
 
@@ -100,7 +99,7 @@ class Propagation:
         """[h, w] bool at the newest frame; None before the first mask."""
         return self._mask
 
-    def _places(self, old: Half, new: Half) -> Floats:
+    def _places(self, old: Half, new: Half) -> Float32Array:
         """[h, w, 2] px: where every pixel of the new frame was in the old one."""
         if self._grid is None:
             rows, columns = np.indices(new.gray.shape, dtype=np.float32)
@@ -110,7 +109,7 @@ class Propagation:
         return np.asarray(self._grid + self._flow.calc(new.gray, old.gray, None), dtype=np.float32)
 
 
-def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
+def carry(mask: Mask, old: Half, new: Half, places: Float32Array) -> Mask:
     """One step. mask: [h, w] at the old frame; places: [h, w, 2] px in the old frame. Returns [h,
     w] at the new one.
 
@@ -129,7 +128,7 @@ def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
     return cut_by_depth((fetched > 127) & ~jumped, new.depth)
 
 
-def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
+def cut_by_depth(mask: Mask, depth: Float32Array) -> Mask:
     """Give the band about a mask's edge to what it is as deep as.
 
     mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, without the mask's inside
@@ -145,7 +144,7 @@ def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
     return np.where(decided, as_inside, mask)
 
 
-def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:
+def _as_deep(part: Mask, depth: Float32Array) -> tuple[Mask, Mask]:
     """Where some of a part of the image [h, w] is nearby, and where depth is its mean there, +-0.3
     m.
     """

@@ -9,10 +9,11 @@ import numpy as np
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import Culling
-from cohdc_train.slam.dynamics.masks import Mask, grow
+from cohdc_train.slam.dynamics.masks import grow
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.tum import read_mask
+from cohdc_train.types import Mask
 
 if TYPE_CHECKING:  # it loads onnxruntime, which a run without a model does not need
     from cohdc_train.segmenter import Detections, Segmenter

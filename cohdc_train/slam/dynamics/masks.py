@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from cohdc_train.types import Mask
 
 
 def grow(mask: Mask, radius: float) -> Mask:

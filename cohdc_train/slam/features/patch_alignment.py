@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from cohdc_train.slam.features.keypoints import SCALE
 from cohdc_train.slam.geometry.se3 import Array
+from cohdc_train.types import Float32Array
 
 PATCH_PX = 16  # px, side of a stored patch at its corner's level
 TEMPLATE_PX = 8  # px, side of the part that is compared
@@ -16,7 +17,6 @@ _FURTHEST = 1.5  # px at the corner's level: what fits better further off is som
 _DONE = 0.03  # px
 _LIKENESS = 0.8  # least normalised correlation of patch and image
 _TEXTURE = 400.0  # least eigenvalue of the patch's gradients, squared grey values
-Floats = NDArray[np.float32]
 
 
 class Pyramid:
@@ -30,11 +30,11 @@ class Pyramid:
             size = (round(width / SCALE**level), round(height / SCALE**level))
             smaller = cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR_EXACT)
             levels.append(np.asarray(smaller, dtype=np.uint8))
-        self.levels: list[Floats] = [level.astype(np.float32) for level in levels]
+        self.levels: list[Float32Array] = [level.astype(np.float32) for level in levels]
 
     def cut(
         self, pixels: Array, octaves: NDArray[np.int64], side: int, shift: Array | float = 0.0
-    ) -> Floats:
+    ) -> Float32Array:
         """Grey values of the square around each of pixels [n, 2] px of level 0. side, and shift [n,
         2]: px of each one's own level.
 
@@ -53,13 +53,13 @@ class Pyramid:
         return result
 
 
-def square(side: int) -> Floats:
+def square(side: int) -> Float32Array:
     """[2, side * side] offsets x and y of a square's pixels from its middle, px, row by row."""
     places = np.arange(side, dtype=np.float32) - (side - 1) / 2
     return np.stack([np.tile(places, side), np.repeat(places, side)])
 
 
-def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
+def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Float32Array:
     """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image,
     at their levels.
     """
@@ -75,7 +75,7 @@ def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
 
 
 def align(
-    pyramid: Pyramid, pixels: Array, octaves: NDArray[np.int64], template: Floats
+    pyramid: Pyramid, pixels: Array, octaves: NDArray[np.int64], template: Float32Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Minimise eq. 8 over each pixel by inverse composition; image and patch may differ in
     brightness and contrast.
@@ -114,7 +114,7 @@ def _least_eigenvalue(H: Array) -> Array:
     return np.asarray(mean - np.hypot(half, H[:, 0, 1]))
 
 
-def _centered(patches: Floats) -> Floats:
+def _centered(patches: Float32Array) -> Float32Array:
     """[n, k]: every patch without its mean."""
     flat = patches.reshape(len(patches), -1)
     return np.asarray(flat - flat.mean(axis=1, keepdims=True), dtype=np.float32)

@@ -14,7 +14,7 @@ from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, publish
 from cohdc_train.slam.frame import FrameRecord
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 _VERB = "slam"
 _NAMES = (
@@ -72,7 +72,7 @@ def write_run(
     config: dict[str, Any],
 ) -> None:
     """Write trajectory.txt, metrics.json, frames.csv and config.yaml into an existing folder."""
-    write_tum(folder / "trajectory.txt", trajectory)
+    trajectory.save_tum(folder / "trajectory.txt")
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     with (folder / "frames.csv").open("w", encoding="utf-8", newline="") as file:

@@ -17,36 +17,6 @@ from cohdc_train.trajectory.association import associate
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One associated pair; `t` and `stamp` are the colour image's, s; `depth_stamp` is the depth
-    image's own.
-    """
-
-    t: float
-    stamp: str
-    depth_stamp: str
-    rgb: Path
-    depth: Path
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """frames in the order of time; `without_depth`: how many colour images found no depth image
-    near enough.
-    """
-
-    folder: Path
-    frames: tuple[Frame, ...]
-    without_depth: int
-
-    @property
-    def groundtruth(self) -> Path | None:
-        """groundtruth.txt when the folder has one."""
-        path = self.folder / "groundtruth.txt"
-        return path if path.is_file() else None
-
-
-@dataclass(frozen=True)
 class Entry:
     """A line of a list. t: s; stamp: t as the line writes it; image: the file it names."""
 
@@ -55,25 +25,22 @@ class Entry:
     image: Path
 
 
-def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
-    """Read the two lists and pair them one to one, nearest stamps first, as TUM's associate tool
-    does.
-
-    max_difference: s. Raises DataError naming file and line for a missing or broken list, stamps
-    that do not rise, an image that is not there, or when nothing pairs.
-    """
-    pairs, alone = read_pairs(folder / "rgb.txt", folder / "depth.txt", max_difference)
-    frames = tuple(
-        Frame(rgb.t, rgb.stamp, depth.stamp, rgb.image, depth.image) for rgb, depth in pairs
-    )
-    return Sequence(folder, frames, alone)
-
-
 def read_pairs(
     first: Path, second: Path, max_difference: float
 ) -> tuple[list[tuple[Entry, Entry]], int]:
-    """Two lists paired as read_sequence does, and how many of the first stay alone. Raises
-    DataError as it does.
+    """Read two lists and pair their images one to one, nearest stamps first.
+
+    Args:
+        first: list of the first images, such as rgb.txt.
+        second: list of the second images, such as depth.txt.
+        max_difference: largest difference of a pair's stamps, s.
+
+    Returns:
+        The pairs in the order of time, and how many images of the first list have no partner.
+
+    Raises:
+        DataError: a list is missing or broken, its stamps do not rise, an image is missing, or
+            nothing pairs. The message names file and line.
     """
     ours, theirs = _read_list(first), _read_list(second)
     times = np.array([entry.t for entry in ours]), np.array([entry.t for entry in theirs])

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.runtime.executors import NICE
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
+from cohdc_train.types import Mask
 
 Outline = Callable[[View], tuple[Mask, float]]
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import encode_jpeg
 from cohdc_train.slam.dynamics.masks import grow
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera, maps_onto
@@ -28,6 +29,7 @@ _NOISE = (
     0.03,
     0.01,
 )  # m, and a Kinect's m / m^2: depth z is held to be within a + b z^2 of the surface it shows
+_JPEG_QUALITY = 95  # of kept color images
 _DOUBT = 2  # a view through a point outweighs so many that show it
 
 Frame = tuple[float, NDArray[np.uint8], NDArray[np.float32]]
@@ -62,7 +64,7 @@ class KeyframeImages:
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR).astype(np.uint8)
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST).astype(np.float32)
-        jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        jpeg = encode_jpeg(rgb, _JPEG_QUALITY)
         units = np.rint(depth * self._units).astype(np.uint16)
         png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         self._file.write(jpeg + png)

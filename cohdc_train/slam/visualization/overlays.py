@@ -1,11 +1,10 @@
 """Keypoints and masks drawn over color images."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import draw_outline
 from cohdc_train.slam.features.keypoints import Features
 
 _GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
@@ -33,14 +32,5 @@ def draw_after(
 ) -> NDArray[np.uint8]:
     """The corners that were kept, and the outline of the mask. Returns [H, W, 3] RGB."""
     image = draw_before(rgb, features, None)
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image, contours, -1, _YELLOW, 2)
+    draw_outline(image, mask, _YELLOW, thickness=2)
     return image
-
-
-def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Write [H, W, 3] RGB as JPEG."""
-    _, data = cv2.imencode(
-        ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90]
-    )
-    path.write_bytes(data.tobytes())

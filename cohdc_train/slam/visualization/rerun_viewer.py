@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import encode_jpeg
 from cohdc_train.errors import CohdcError, MissingExtraError
 from cohdc_train.slam.frame import FrameRecord, View
 from cohdc_train.slam.geometry.camera import Camera
@@ -20,7 +20,7 @@ from cohdc_train.slam.visualization.point_cloud import PointColors
 _LAST = 5.0  # s that rerun has for the rest when a run is over
 _MEMORY = "25%"  # of the machine's, which the viewer may fill before it forgets the oldest
 _FRUSTUM = 0.15  # m
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+_JPEG_QUALITY = 80
 _MASK = (230, 40, 40)  # RGB
 _WAY = (250, 160, 40)
 
@@ -125,7 +125,7 @@ class Viewer:
                 "world/camera",
                 rerun.Transform3D(translation=pose.T_wc[:3, 3], mat3x3=pose.T_wc[:3, :3]),
             )
-        jpeg = cv2.imencode(".jpg", cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
+        jpeg = encode_jpeg(view.rgb, _JPEG_QUALITY)
         log("world/camera/image", rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if mask is not None:
             log("world/camera/mask", rerun.SegmentationImage(mask.astype(np.uint8), opacity=0.5))

@@ -20,7 +20,7 @@ from tool_loader import load_tool
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 8
 
@@ -263,7 +263,7 @@ def test_the_node_publishes_and_writes(
     truth = camera_path(FRAMES)[-1]
     last = sent["pose"][-1].pose.position
     np.testing.assert_allclose([-last.y, -last.z, last.x], truth[:3, 3], atol=0.01)
-    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
+    assert len(Trajectory.load_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
 
 
 def test_the_newest_frame_replaces_the_one_that_waits(

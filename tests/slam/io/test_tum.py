@@ -8,7 +8,7 @@ import pytest
 from plane_world import CAMERA
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.io.tum import read_depth, read_mask, read_rgb, read_sequence
+from cohdc_train.slam.io.tum import Entry, read_depth, read_mask, read_pairs, read_rgb
 
 
 def folder(tmp_path: Path, rgb: list[float], depth: list[float]) -> Path:
@@ -22,12 +22,17 @@ def folder(tmp_path: Path, rgb: list[float], depth: list[float]) -> Path:
     return tmp_path
 
 
+def pairs_of(root: Path) -> tuple[list[tuple[Entry, Entry]], int]:
+    """Read the pairs of a sequence."""
+    return read_pairs(root / "rgb.txt", root / "depth.txt", 0.02)
+
+
 def test_nearest_association_one_to_one(tmp_path: Path) -> None:
-    sequence = read_sequence(folder(tmp_path, [1.000, 1.030, 1.060, 2.0], [1.005, 1.028, 1.034]))
-    pairs = [(frame.stamp, frame.depth.stem) for frame in sequence.frames]
-    assert pairs == [("1.000", "1.005"), ("1.030", "1.028")]
-    assert sequence.without_depth == 2
-    assert sequence.groundtruth is None
+    root = folder(tmp_path, [1.000, 1.030, 1.060, 2.0], [1.005, 1.028, 1.034])
+    pairs, without_depth = pairs_of(root)
+    stamps = [(color.stamp, depth.image.stem) for color, depth in pairs]
+    assert stamps == [("1.000", "1.005"), ("1.030", "1.028")]
+    assert without_depth == 2
 
 
 @pytest.mark.parametrize(
@@ -48,14 +53,14 @@ def test_a_broken_list_is_one_line_with_its_place(tmp_path: Path, text: str, sai
     root = folder(tmp_path, [1.0], [1.0])
     (root / "rgb.txt").write_text(text)
     with pytest.raises(DataError) as caught:
-        read_sequence(root)
+        pairs_of(root)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_list_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"rgb\.txt: cannot be read"):
-        read_sequence(tmp_path)
+        pairs_of(tmp_path)
 
 
 def test_images_are_read_in_their_units(tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from cohdc_train.cli import main
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import Method
 from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, halve_mask
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.frame import View
 from cohdc_train.slam.geometry.se3 import exp_se3, to_local
 from cohdc_train.slam.mapping.local_bundle_adjustment import Solution, close_window, open_window
@@ -30,6 +29,7 @@ from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.tracking.tracker import Tracker
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import Mask
 
 LONG = 20.0  # s: no wait of a thread here takes that long unless it hangs
 

@@ -11,12 +11,13 @@ from ply_reader import read_ply
 
 from cohdc_train.slam.run import slam
 from cohdc_train.trajectory.association import match
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 pytest.importorskip("embreex", reason="the renderer comes with the train extra")
 
 from cohdc_train.synth.renderer import render
-from cohdc_train.synth.sequence import Scene, draw_scene, sequence
+from cohdc_train.synth.scenario import RenderedScene, draw_scene
+from cohdc_train.synth.sequence import sequence
 
 FRAMES, SIZE = 60, (240, 320)
 
@@ -25,12 +26,16 @@ def in_the_world(run: Path, folder: Path) -> NDArray[np.float64]:
     """[n, 3] a run's cloud in the ground truth's world, m, by the first pose: a short way fixes no
     rotation.
     """
-    truth, estimate = match(read_tum(folder / "groundtruth.txt"), read_tum(run / "trajectory.txt"))
+    truth, estimate = match(
+        Trajectory.load_tum(folder / "groundtruth.txt"), Trajectory.load_tum(run / "trajectory.txt")
+    )
     T = truth.poses[0] @ np.linalg.inv(estimate.poses[0])
     return np.asarray(read_ply(run / "cloud.ply")[0] @ T[:3, :3].T + T[:3, 3])
 
 
-def errors_and_people(points: NDArray[np.float64], scene: Scene) -> tuple[NDArray[np.float64], int]:
+def errors_and_people(
+    points: NDArray[np.float64], scene: RenderedScene
+) -> tuple[NDArray[np.float64], int]:
     """[n] m from each point to the empty room's surface behind or before it, in the true view that
     shows it best; and how many of those that are 10 cm off in every view lie within 10 cm of
     somebody, 20 cm before the room, in one."""
@@ -38,7 +43,7 @@ def errors_and_people(points: NDArray[np.float64], scene: Scene) -> tuple[NDArra
     best, people = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.bool_)
     for frame in range(0, FRAMES, 4):
         room = render(scene.room.mesh, atlas, scene.room.lighting, camera, scene.poses[frame]).depth
-        full = scene.view(frame, atlas)
+        full = scene.render_frame(frame, atlas)
         local = (points - scene.poses[frame][:3, 3]) @ scene.poses[frame][:3, :3]
         ahead = np.flatnonzero(local[:, 2] > 0.1)
         x, y, z = local[ahead].T

@@ -1,4 +1,4 @@
-"""Geometry: whatever is drawn, boxes equal their masks' extents and masks stay on their pixels."""
+"""Geometry: boxes equal their masks' extents, and masks stay on their pixels."""
 
 import math
 
@@ -20,8 +20,8 @@ from cohdc_train.data.transforms import (
 sides = st.integers(20, 120)
 
 
-def picture(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A picture whose red channel is 255 exactly under the mask, and the mask."""
+def draw_image(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return an image whose red channel is 255 exactly under the mask, and the mask."""
     mask = torch.zeros((height, width), dtype=torch.uint8)
     mask[height // 4 : height // 2, width // 5 : width // 2] = 1
     return torch.stack([mask * 255, mask * 0 + 40, mask * 0 + 80]), mask
@@ -40,7 +40,7 @@ def test_masks_stay_on_their_pixels_and_crowd_boxes_follow(
     height: int, width: int, rows: int, columns: int, seed: int, flip: bool
 ) -> None:
     torch.manual_seed(seed)
-    pixels, whole = picture(height, width)
+    pixels, whole = draw_image(height, width)
     placement = Placement.draw((height, width), (rows, columns), Augmentation(flip=float(flip)))
     assert placement.mirrored == flip
     image, mask = placement.image(pixels), placement.mask(whole) > 0
@@ -76,7 +76,7 @@ def test_mask_boxes_are_the_extents(height: int, width: int, seed: int) -> None:
 
 
 def test_without_jitter_the_image_fits_and_the_rest_is_zero() -> None:
-    pixels, mask = picture(40, 40)
+    pixels, mask = draw_image(40, 40)
     placement = Placement.draw((40, 40), (60, 100), Augmentation(0.0, (1.0, 1.0)))
     image = placement.image(pixels)
     assert placement.size == (60, 60)
@@ -85,7 +85,7 @@ def test_without_jitter_the_image_fits_and_the_rest_is_zero() -> None:
     assert mask_boxes(placement.mask(mask)[None]).tolist() == [[12, 15, 30, 30]]
 
 
-def test_the_jitter_covers_its_range() -> None:
+def test_scale_jitter_covers_its_range() -> None:
     torch.manual_seed(0)
     placements = [
         Placement.draw((60, 60), (60, 60), Augmentation(0.5, (0.5, 1.5))) for _ in range(300)
@@ -98,12 +98,12 @@ def test_the_jitter_covers_its_range() -> None:
 
 
 @pytest.mark.parametrize("jitter", [(0.0, 1.0), (1.5, 0.5)])
-def test_a_senseless_jitter_is_refused(jitter: tuple[float, float]) -> None:
+def test_invalid_scale_jitter_is_refused(jitter: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="scale_jitter"):
         Augmentation(scale_jitter=jitter)
 
 
-def test_a_probability_above_one_is_refused() -> None:
+def test_probability_above_one_is_refused() -> None:
     with pytest.raises(ValueError, match="copy_paste 2"):
         Augmentation(copy_paste=2)
 
@@ -123,10 +123,8 @@ def test_photometry_changes_every_image_by_itself_and_padding_is_blanked() -> No
     assert (blank[3, :, 1:, 1:] == 0).all()
 
 
-def test_a_moving_cameras_faults_leave_an_image_in_its_range() -> None:
-    """Every fault at once, on stripes: the image is another one, blurred and darker or lighter, and
-    still an image.
-    """
+def test_degraded_images_stay_in_value_range() -> None:
+    """All faults together change striped images, which stay in 0..1."""
     torch.manual_seed(0)
     faults = photometric_augmentation(Augmentation(photometric=False, degrade=1.0))
     assert faults is not None

@@ -1,4 +1,4 @@
-"""The source's own split: kept by the names of folders and lists, and test is never trained on."""
+"""Own split of a source: kept by the names of folders and lists, without test images."""
 
 import json
 import tempfile
@@ -8,7 +8,7 @@ from typing import Any
 
 import foreign_toys as toys
 import pytest
-from conversion import converted, file_names, refused
+from conversion import assert_refused, converted, file_names
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,14 +25,14 @@ FOLDERS = st.sampled_from([*NAMED, *MORE])
 
 
 def build(format: str, root: Path, folders: dict[str, int]) -> Path:
-    """A number of images in each folder, numbered on, with labelme's JSON files or VIA's."""
+    """Write images into folders, numbered through, with labelme's JSON files or VIA's."""
     seed = 0
     for folder, count in folders.items():
         entries = {}
         for _ in range(count):
             seed += 1
             name = f"{seed}.png"
-            toys.picture(root / folder / name, seed)
+            toys.draw_image(root / folder / name, seed)
             if format == "labelme":
                 shape = toys.shape("person", "polygon", toys.PERSON)
                 toys.labelme_file(root / folder / f"{seed}.json", [shape])
@@ -49,7 +49,7 @@ def stems(splits: dict[str, Any]) -> dict[str, list[int]]:
 @pytest.mark.parametrize("format", ["labelme", "via"])
 @pytest.mark.parametrize("names", [("train", "val", "test"), ("Train", "Validation", "TEST")])
 @pytest.mark.parametrize("above", [".", "set", "set/labels"])
-def test_train_and_val_stay_what_they_are_and_test_is_left_out(
+def test_own_split_is_kept_and_test_images_are_skipped(
     tmp_path: Path, format: str, names: tuple[str, ...], above: str, capsys: Captured
 ) -> None:
     counts = dict(zip([f"{above}/{name}" for name in names], (6, 2, 4), strict=True))
@@ -64,8 +64,8 @@ def test_train_and_val_stay_what_they_are_and_test_is_left_out(
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(["labelme", "via"]), st.dictionaries(FOLDERS, st.integers(1, 2), min_size=1))
-def test_no_test_image_is_converted_and_none_is_lost(format: Any, folders: dict[str, int]) -> None:
-    """Whatever the mixture of folders."""
+def test_every_test_image_is_skipped_and_counted(format: Any, folders: dict[str, int]) -> None:
+    """It holds for any mixture of folders."""
     owners: dict[int, str] = {}
     for folder, count in folders.items():
         parts = [NAMED.get(part.lower(), "") for part in folder.split("/")]
@@ -76,12 +76,14 @@ def test_no_test_image_is_converted_and_none_is_lost(format: Any, folders: dict[
     with tempfile.TemporaryDirectory() as place:
         root = build(format, Path(place) / "source", folders)
         if usable < 2:
-            refused(Path(place), format, root, "images are of the test split|1 image; two or more")
+            assert_refused(
+                Path(place), format, root, "images are of the test split|1 image; two or more"
+            )
             return
         found = stems(converted(format, root))
     own = kinds["train"] > 0 and kinds["val"] > 0
-    for name, numbers in found.items():
-        owned = {owners[number] for number in numbers}
+    for name, rows in found.items():
+        owned = {owners[number] for number in rows}
         assert owned == {name} if own else "test" not in owned
     expected = kinds["train"] + kinds["val"] if own else usable
     assert len(found["train"]) + len(found["val"]) == expected
@@ -98,7 +100,7 @@ def test_no_test_image_is_converted_and_none_is_lost(format: Any, folders: dict[
         (("train", "val", "extra", "test"), "the source's own", 2),
     ],
 )
-def test_one_line_says_what_a_mixture_of_folders_becomes(
+def test_split_of_mixed_folders_is_printed_in_one_line(
     tmp_path: Path, format: str, folders: tuple[str, ...], line: str, left: int, capsys: Captured
 ) -> None:
     splits = converted(format, build(format, tmp_path / "source", dict.fromkeys(folders, 2)))
@@ -109,16 +111,18 @@ def test_one_line_says_what_a_mixture_of_folders_becomes(
 
 
 @pytest.mark.parametrize("format", ["labelme", "via"])
-def test_test_images_alone_are_converted_only_when_asked_for(tmp_path: Path, format: str) -> None:
+def test_test_images_alone_are_converted_only_on_request(tmp_path: Path, format: str) -> None:
     root = build(format, tmp_path / "source", {"test": 3})
-    refused(tmp_path, format, root, "source: all 3 images are of the test split; to use them, ")
+    assert_refused(
+        tmp_path, format, root, "source: all 3 images are of the test split; to use them, "
+    )
     convert(format, root / "test", tmp_path / "out")
 
 
-def test_labelme_files_beside_image_folders_follow_the_images(tmp_path: Path) -> None:
+def test_labelme_files_in_another_folder_follow_split_of_images(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for i, split in enumerate(("train", "train", "val", "test")):
-        toys.picture(root / split / f"{i}.png", i)
+        toys.draw_image(root / split / f"{i}.png", i)
         shape = toys.shape("person", "polygon", toys.PERSON)
         toys.labelme_file(root / "labels" / f"{i}.json", [shape], f"../{split}/{i}.png")
     assert stems(converted("labelme", root)) == {"train": [0, 1], "val": [2]}
@@ -162,8 +166,8 @@ def test_voc_counts_the_images_of_its_test_list(tmp_path: Path, capsys: Captured
     assert line in capsys.readouterr().out.splitlines()
 
 
-def test_voc_never_draws_from_the_test_list(tmp_path: Path, capsys: Captured) -> None:
-    """As CVAT writes its lists, with a capital letter."""
+def test_voc_split_is_never_drawn_from_test_list(tmp_path: Path, capsys: Captured) -> None:
+    """CVAT writes its lists with a capital letter."""
     root = toys.voc(tmp_path / "source")
     lists = root / "ImageSets" / "Segmentation"
     for name in ("train", "val"):

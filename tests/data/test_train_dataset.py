@@ -1,4 +1,4 @@
-"""Training samples: what copy-paste does to pixels, masks and boxes, and mini-masks."""
+"""Training samples: effect of copy-paste on pixels, masks and boxes, and mini-masks."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cohdc_train.data.annotations import CocoImage, CocoObject
-from cohdc_train.data.train_dataset import CocoTrainSet
+from cohdc_train.data.train_dataset import CocoTrainDataset
 from cohdc_train.data.transforms import Augmentation, mask_boxes
 
 STILL = Augmentation(flip=0.0, scale_jitter=(1.0, 1.0), photometric=False)
@@ -27,15 +27,15 @@ def rectangle(
 def image(
     folder: Path,
     number: int,
-    colour: int,
+    color: int,
     objects: list[CocoObject],
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ):
-    """A grey image with its objects' boxes in its own colour."""
+    """Write a gray image with its objects' boxes in its own color."""
     pixels = np.full((*size, 3), 20, dtype=np.uint8)
     for o in objects:
         x, y, w, h = (int(v) for v in o.box)
-        pixels[y : y + h, x : x + w] = colour
+        pixels[y : y + h, x : x + w] = color
     path = folder / f"{number}.png"
     cv2.imwrite(str(path), pixels)
     return CocoImage(number, path, *size, tuple(objects))
@@ -43,8 +43,9 @@ def image(
 
 @pytest.fixture
 def two(tmp_path: Path) -> list[CocoImage]:
-    """One image with a large object (label 1), one with a smaller (label 2) that would lie over its
-    middle.
+    """Return an image with a large object (label 1), and one with a smaller (label 2).
+
+    The smaller would lie over the middle of the large one.
     """
     behind = image(tmp_path, 1, 100, [rectangle(1, 1, (10, 10, 60, 40))])
     before = image(tmp_path, 2, 200, [rectangle(2, 2, (30, 20, 20, 20))])
@@ -53,17 +54,17 @@ def two(tmp_path: Path) -> list[CocoImage]:
 
 def samples(images: list[CocoImage], augment: Augmentation, count: int = 20, **kwargs):
     torch.manual_seed(0)
-    return [CocoTrainSet(images, (HEIGHT, WIDTH), augment, **kwargs)[0] for _ in range(count)]
+    return [CocoTrainDataset(images, (HEIGHT, WIDTH), augment, **kwargs)[0] for _ in range(count)]
 
 
-def test_without_pasting_a_sample_is_its_image(two: list[CocoImage]) -> None:
+def test_sample_without_pasting_equals_image(two: list[CocoImage]) -> None:
     pixels, target = samples(two, STILL, 1)[0]
     assert target["boxes"].tolist() == [[10, 10, 70, 50]]
     assert target["size"] == (HEIGHT, WIDTH)
     assert torch.equal(pixels[0] == 100, target["masks"][0] > 0)
 
 
-def test_a_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
+def test_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
     seen = set()
     for pixels, target in samples(two, PASTING):
         labels = target["labels"].tolist()
@@ -75,8 +76,8 @@ def test_a_pasted_object_hides_what_is_behind_it(two: list[CocoImage]) -> None:
     assert (1, 2) in seen
 
 
-def test_an_object_hardly_seen_any_more_is_ignored(tmp_path: Path) -> None:
-    """Its rest (4 of 64 rows' worth) is neither an object nor background."""
+def test_nearly_hidden_object_is_ignored(tmp_path: Path) -> None:
+    """Its visible rest (4 of 64 rows) is neither an object nor background."""
     small = image(tmp_path, 1, 100, [rectangle(1, 1, (30, 20, 21, 20))])
     large = image(tmp_path, 2, 200, [rectangle(2, 2, (20, 10, 30, 40))])
     pasted = [t for _, t in samples([small, large], PASTING) if t["labels"].tolist() == [2]]
@@ -96,12 +97,12 @@ def test_nothing_is_pasted_into_the_padding(tmp_path: Path) -> None:
         assert target["boxes"][-1].tolist() == [20, 10, 50, 30]
 
 
-def test_giver_without_objects_and_crowds(tmp_path: Path) -> None:
+def test_paste_source_without_objects_or_with_crowds_changes_nothing(tmp_path: Path) -> None:
     empty = image(tmp_path, 1, 100, [])
     crowd = image(tmp_path, 2, 200, [rectangle(1, 1, (10, 10, 20, 20), crowd=True)])
     for index, expected in ((0, []), (1, [[10, 10, 30, 30]])):
         torch.manual_seed(0)
-        _, target = CocoTrainSet([empty, crowd], (HEIGHT, WIDTH), PASTING)[index]
+        _, target = CocoTrainDataset([empty, crowd], (HEIGHT, WIDTH), PASTING)[index]
         assert target["labels"].tolist() == []
         assert target["masks"].shape == (0, HEIGHT, WIDTH)
         assert target["ignore"].tolist() == expected
@@ -114,13 +115,13 @@ def test_mini_masks_lie_on_their_boxes(two: list[CocoImage]) -> None:
     assert torch.equal(target["frames"], target["boxes"])
     assert (target["masks"][:, 1:-1, 1:-1] == 1).all()
     assert (target["masks"] > 0.85).all()  # half a pixel beyond the edge weighs in
-    _, none = CocoTrainSet(
+    _, none = CocoTrainDataset(
         [CocoImage(3, two[0].path, HEIGHT, WIDTH, ())], (HEIGHT, WIDTH), STILL, (28, 28)
     )[0]
     assert none["masks"].shape == (0, 28, 28)
     assert none["frames"].shape == (0, 4)
 
 
-def test_only_givers_give(two: list[CocoImage]) -> None:
-    pasted = samples(two[:1], PASTING, 10, givers=two[1:])
+def test_objects_come_only_from_paste_sources(two: list[CocoImage]) -> None:
+    pasted = samples(two[:1], PASTING, 10, paste_sources=two[1:])
     assert [t["labels"].tolist() for _, t in pasted] == [[1, 2]] * 10

@@ -1,11 +1,11 @@
-"""VGG Image Annotator: versions, shapes, where the class is, and every mistake named."""
+"""VGG Image Annotator: versions, shapes, class attributes, and named errors."""
 
 import json
 from pathlib import Path
 
 import foreign_toys as toys
 import pytest
-from conversion import converted, iou, masks_of, refused
+from conversion import assert_refused, converted, iou, masks_of
 
 from cohdc_train.data.coco import find_split, read_split
 from cohdc_train.data.convert import convert
@@ -13,7 +13,7 @@ from cohdc_train.errors import DataError
 
 
 @pytest.mark.parametrize("version", ["project", "2", "1"])
-def test_via_every_version_and_every_shape_with_an_inside(
+def test_via_reads_every_version_and_shape(
     tmp_path: Path, version: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = tmp_path / "source"
@@ -49,7 +49,7 @@ def test_via_every_version_and_every_shape_with_an_inside(
             "_via_attributes": {"region": {}},
         }
     toys.write(root / "via.json", content)
-    toys.picture(root / "new.png", 30)
+    toys.draw_image(root / "new.png", 30)
     splits = converted("via", root)
     found = masks_of(splits, "a")
     assert [name for name, _ in found] == ["person", "car", "person", "person", "person", "person"]
@@ -68,7 +68,7 @@ def test_via_every_version_and_every_shape_with_an_inside(
         assert line in printed.splitlines()
 
 
-def test_via_the_class_is_in_the_attribute_one_names(tmp_path: Path) -> None:
+def test_via_class_comes_from_named_attribute(tmp_path: Path) -> None:
     root = toys.via(
         tmp_path / "source",
         [toys.region("circle", {"kind": "person", "age": "7"}, cx=32, cy=24, r=12)],
@@ -84,11 +84,11 @@ def test_via_the_class_is_in_the_attribute_one_names(tmp_path: Path) -> None:
     assert splits["train"].class_names == ("car", "person")
 
 
-def test_via_without_attributes_takes_the_one_class_of_a_file(tmp_path: Path) -> None:
+def test_via_without_attributes_takes_class_of_names_file(tmp_path: Path) -> None:
     root = tmp_path / "source"
     content = {}
     for seed in range(3):
-        toys.picture(root / f"{seed}.png", seed)
+        toys.draw_image(root / f"{seed}.png", seed)
         regions = {"0": toys.region("circle", {}, cx=32, cy=24, r=12)}
         content[f"{seed}"] = {"filename": f"{seed}.png", "regions": regions}
     path = toys.write(root / "via_region_data.json", content)
@@ -114,7 +114,7 @@ VIA_ERRORS = {
         "images": [],
         "annotations": [],
     },
-    r"via\.json: image 'https://x\.org/a\.png' is not beside it$": {
+    r"via\.json: image 'https://x\.org/a\.png' is not in its folder$": {
         "a": {"filename": "https://x.org/a.png", "regions": toys.person_and_car()}
     },
     r"via\.json: a\.png: region 1: no shape_attributes$": {
@@ -144,7 +144,7 @@ VIA_ERRORS = {
 
 
 @pytest.mark.parametrize("message", VIA_ERRORS)
-def test_via_errors(tmp_path: Path, message: str) -> None:
+def test_via_error_names_file_and_region(tmp_path: Path, message: str) -> None:
     root = toys.via(tmp_path / "source")
     toys.write(root / "via.json", VIA_ERRORS[message])
-    refused(tmp_path, "via", root, message)
+    assert_refused(tmp_path, "via", root, message)

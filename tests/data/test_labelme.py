@@ -1,6 +1,4 @@
-"""labelme: every shape with an inside, images inside the JSON or turned by EXIF, and every mistake
-named.
-"""
+"""labelme: shapes, images inside the JSON or turned by EXIF, and named errors."""
 
 import base64
 from pathlib import Path
@@ -9,16 +7,14 @@ import cv2
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import converted, drawn, image_of, iou, masks_of, refused
+from conversion import assert_refused, converted, drawn, image_of, iou, masks_of
 from PIL import Image
 
 from cohdc_train.cli import main
 from cohdc_train.data.annotations import read_image
 
 
-def test_labelme_every_shape_with_an_inside(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_labelme_reads_every_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = toys.labelme(tmp_path / "source")
     spot = np.pad(np.ones((5, 7), np.uint8), ((1, 0), (0, 2)))
     groups = [[2.0, 2.0, 12.0, 2.0, 12.0, 9.0, 2.0, 9.0], [40.0, 30.0, 50.0, 30.0, 45.0, 40.0]]
@@ -71,7 +67,7 @@ def test_labelme_every_shape_with_an_inside(
     assert outside in capsys.readouterr().out.splitlines()
 
 
-def test_labelme_image_inside_the_json_or_elsewhere(tmp_path: Path) -> None:
+def test_labelme_image_is_found_inside_json_or_in_other_folder(tmp_path: Path) -> None:
     root = toys.labelme(tmp_path / "source" / "json")
     png = (root / "a.png").read_bytes()
     data = toys.base64_png(np.asarray(Image.open(root / "a.png")))
@@ -98,18 +94,18 @@ def test_labelme_image_inside_the_json_or_elsewhere(tmp_path: Path) -> None:
     )
 
 
-def test_pictures_that_exif_turns_are_written_as_they_were_annotated(
+def test_images_turned_by_exif_are_written_as_annotated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Orientation 6 shows the right column first; the file's width is the picture's height."""
+    """Orientation 6 shows the right column first; the file's width is the image's height."""
     root = toys.labelme(tmp_path / "source")
     shapes = [toys.shape("person", "polygon", toys.PERSON)]
-    toys.picture(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)
+    toys.draw_image(root / "turned.jpg", 20, (toys.WIDTH, toys.HEIGHT), exif=6)
     toys.labelme_file(root / "turned.json", shapes, "turned.jpg")
-    toys.picture(root / "plain.jpg", 21, exif=8)
+    toys.draw_image(root / "plain.jpg", 21, exif=8)
     toys.labelme_file(root / "plain.json", shapes, "plain.jpg")
     data = (
-        toys.picture(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
+        toys.draw_image(tmp_path / "inside.jpg", 22, (toys.WIDTH, toys.HEIGHT), exif=6)
     ).read_bytes()
     toys.labelme_file(root / "inside.json", shapes, "no.jpg", imageData=embedded(data))
     splits = converted("labelme", root)
@@ -122,7 +118,7 @@ def test_pictures_that_exif_turns_are_written_as_they_were_annotated(
     assert image_of(splits, "plain").path.samefile(
         root / "plain.jpg"
     )  # annotated on the unturned pixels
-    assert "       2  image turned as its EXIF says, and written anew: " in capsys.readouterr().out
+    assert "       2  image turned as its EXIF says, and written again: " in capsys.readouterr().out
     assert main(["data", "doctor", str(tmp_path / "source_coco")]) == 0
 
 
@@ -136,7 +132,7 @@ LABELME_ERRORS = {
     r"a\.json: shape 1: no label$": lambda p: toys.labelme_file(
         p, [toys.shape("", "polygon", toys.PERSON)]
     ),
-    r"a\.json: shape 1: circle needs its centre": lambda p: toys.labelme_file(
+    r"a\.json: shape 1: circle needs its center": lambda p: toys.labelme_file(
         p, [toys.shape("x", "circle", [1, 2])]
     ),
     r"a\.json: shape 2: rectangle needs two": lambda p: toys.labelme_file(
@@ -168,7 +164,7 @@ LABELME_ERRORS = {
 
 
 @pytest.mark.parametrize("message", LABELME_ERRORS)
-def test_labelme_errors(tmp_path: Path, message: str) -> None:
+def test_labelme_error_names_file_and_shape(tmp_path: Path, message: str) -> None:
     root = toys.labelme(tmp_path / "source")
     LABELME_ERRORS[message](root / "a.json")
-    refused(tmp_path, "labelme", root, message)
+    assert_refused(tmp_path, "labelme", root, message)

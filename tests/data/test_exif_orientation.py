@@ -21,9 +21,9 @@ from cohdc_train.data.annotations import read_image
 from cohdc_train.data.coco import CocoImage, find_split, read_split
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.data.doctor import sample_grid as grid
-from cohdc_train.exporter.sample_images import read_images
+from cohdc_train.exporter.sample_images import read_samples
 from cohdc_train.images import orientation_of, read_rgb
-from cohdc_train.prediction.image_sources import read_pictures
+from cohdc_train.prediction.image_sources import read_images
 
 Captured = pytest.CaptureFixture[str]
 HEIGHT, WIDTH = 96, 128
@@ -47,7 +47,7 @@ STORED = {
 
 
 def draw(box: tuple[int, ...] = BOX) -> Image.Image:
-    """An image with one object in it."""
+    """Draw an image with one object in it."""
     x, y, w, h = box
     pixels = np.full((HEIGHT, WIDTH, 3), GROUND, np.uint8)
     pixels[y : y + h, x : x + w] = COLOR
@@ -65,7 +65,7 @@ def save(upright: Image.Image, path: Path, orientation: int) -> Path:
 
 
 def folder(root: Path, orientations: Any = ALL, as_stored: bool = False) -> Path:
-    """A COCO-format folder with a training image per orientation and two plain validation images.
+    """Write a folder with a training image per orientation and two plain validation images.
 
     as_stored: the labels are of the stored pixels, not of the upright image.
     """
@@ -89,7 +89,7 @@ def folder(root: Path, orientations: Any = ALL, as_stored: bool = False) -> Path
 
 
 def stored_place(file: Path) -> tuple[list[int], tuple[int, int]]:
-    """The object's box in the stored pixels, and their size (width, height)."""
+    """Return the object's box in the stored pixels, and their size (width, height)."""
     with Image.open(file) as image:
         inside = np.asarray(image.convert("RGB"))[..., 0] > 120
     rows, columns = np.nonzero(inside.any(axis=1))[0], np.nonzero(inside.any(axis=0))[0]
@@ -102,15 +102,15 @@ def train_images(root: Path) -> tuple[CocoImage, ...]:
 
 
 def assert_labeled(pixels: NDArray[np.uint8], mask: NDArray[Any]) -> None:
-    """The mask covers the object and nothing else is of its color."""
+    """Assert that the mask covers the object, and that nothing else has its color."""
     assert np.abs(pixels[mask > 0].mean(axis=0) - COLOR).max() < 15
     assert np.abs(pixels[mask == 0].mean(axis=0) - GROUND).max() < 15
 
 
 def doctor(root: Path, *options: str) -> tuple[int, dict[str, list[str]]]:
-    """Exit code, and the training split's findings."""
+    """Run the doctor, and return the exit code and the training split's issues."""
     code = main(["data", "doctor", str(root), "--out", str(root / "seen"), *options])
-    return code, json.loads((root / "seen" / "findings.json").read_text())["train"]
+    return code, json.loads((root / "seen" / "issues.json").read_text())["train"]
 
 
 def test_labels_of_the_upright_image_lie_on_the_object(tmp_path: Path, capsys: Captured) -> None:
@@ -143,7 +143,7 @@ def test_labels_of_the_stored_pixels_lie_on_the_object(tmp_path: Path, capsys: C
 
 
 @pytest.mark.parametrize("as_stored", [False, True])
-def test_training_and_validation_see_what_was_annotated(tmp_path: Path, as_stored: bool) -> None:
+def test_training_and_validation_read_image_as_annotated(tmp_path: Path, as_stored: bool) -> None:
     root = folder(tmp_path / "a", QUARTERS if as_stored else ALL, as_stored)
     (root / "instances_val.json").write_bytes((root / "instances_train.json").read_bytes())
     data = CocoDataModule(root, canvas=(HEIGHT, WIDTH), batch_size=1, workers=0)
@@ -170,16 +170,16 @@ def test_every_reader_gives_the_same_upright_image(tmp_path: Path, suffix: str) 
     mask = np.asarray(draw())[..., 0] == COLOR[0]
     for path in sorted((tmp_path / "b").iterdir()):
         assert_labeled(read_image(CocoImage(1, path, HEIGHT, WIDTH, ())), mask)
-        (shown,) = read_pictures(path)
+        (shown,) = read_images(path)
         assert_labeled(shown.rgb, mask)
         fitted = grid.read_fitted(CocoImage(1, path, HEIGHT, WIDTH, ()), (HEIGHT, WIDTH))
-        assert_labeled(np.ascontiguousarray(fitted[..., ::-1]), mask)
+        assert_labeled(fitted, mask)
     if suffix != "tif":
-        for pixels in read_images(tmp_path / "b", 8):
+        for pixels in read_samples(tmp_path / "b", 8):
             assert_labeled(pixels, mask)
 
 
-def test_a_turned_copy_of_a_validation_image_is_a_leak(tmp_path: Path) -> None:
+def test_turned_copy_of_validation_image_is_a_leak(tmp_path: Path) -> None:
     """Duplicates are found among the upright images."""
     root = folder(tmp_path / "a", (1, 3, 6, 8))
     scene = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
@@ -192,7 +192,7 @@ def test_a_turned_copy_of_a_validation_image_is_a_leak(tmp_path: Path) -> None:
     assert len(found["leak"]) == 4
 
 
-def test_the_doctor_takes_the_size_that_the_contours_fit(tmp_path: Path) -> None:
+def test_doctor_takes_image_size_that_contours_fit(tmp_path: Path) -> None:
     """A wrong size is replaced by the upright one, or by the stored one where only that fits."""
     root = folder(tmp_path / "a", (6, 6))
     content = json.loads((root / "instances_train.json").read_text())
@@ -212,7 +212,7 @@ def test_the_doctor_takes_the_size_that_the_contours_fit(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("format", ["labelme", "via", "yolo"])
 def test_converted_labels_lie_on_the_object(tmp_path: Path, format: str) -> None:
-    """Whatever the orientation, on disk or inside the JSON; and the doctor has no complaint."""
+    """It holds for any orientation, on disk or inside the JSON, and doctor finds no issue."""
     root = tmp_path / "source"
     x, y, w, h = BOX
     entries: dict[str, Any] = {}
@@ -256,7 +256,7 @@ def test_pixels_are_as_pillow_shows_them(size: tuple[int, int], turned: int, suf
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, of damaged EXIF
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=60), HEADS)
-def test_damaged_exif_turns_nothing_and_stops_nothing(tail: bytes, head: bytes) -> None:
+def test_damaged_exif_is_ignored(tail: bytes, head: bytes) -> None:
     data = io.BytesIO()
     draw().save(data, format="JPEG", exif=head + tail)
     with Image.open(data) as image:

@@ -1,6 +1,4 @@
-"""Every foreign format becomes a folder that training reads: the same masks, nothing lost unsaid,
-or nothing at all.
-"""
+"""Conversion of other formats: exact masks, counted losses, and all or nothing."""
 
 import json
 import os
@@ -12,7 +10,16 @@ from typing import Any
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import BUILD, FORMATS, converted, drawn, file_names, image_of, masks_of, refused
+from conversion import (
+    BUILD,
+    FORMATS,
+    assert_refused,
+    converted,
+    drawn,
+    file_names,
+    image_of,
+    masks_of,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +32,7 @@ from cohdc_train.errors import DataError
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_masks_come_back_and_the_doctor_has_no_complaint(
+def test_converted_masks_are_exact_and_pass_doctor(
     tmp_path: Path, format: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     splits = converted(format, BUILD[format](tmp_path / "source"))
@@ -61,13 +68,13 @@ def test_masks_come_back_and_the_doctor_has_no_complaint(
     assert found == ({"category-unused"} if format == "voc" else set())
 
 
-def test_the_command_line_tells_counts_and_what_comes_next(
+def test_convert_prints_counts_and_next_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = toys.labelme(tmp_path / "source")
     line = toys.shape("person", "linestrip", [1, 1, 9, 9, 20, 4])
     toys.labelme_file(root / "a.json", [toys.shape("person", "polygon", toys.PERSON), line])
-    toys.picture(root / "new.jpg", 9)
+    toys.draw_image(root / "new.jpg", 9)
     out = tmp_path / "out"
     assert (
         main(["data", "convert", "labelme", str(root), str(out), "--val", "0.5", "--seed", "3"])
@@ -77,7 +84,7 @@ def test_the_command_line_tells_counts_and_what_comes_next(
         "split: drawn, --val 0.5 --seed 3",
         "train: images 2; objects 3; class car 1; class person 2",
         "val: images 2; objects 4; class car 2; class person 2",
-        "left out:",
+        "skipped:",
         f"       1  image without a JSON file: {root / 'new.jpg'}",
         f"       1  shape of type 'linestrip': {root / 'a.json'}: shape 2",
         f"next: cohdc data doctor {out}",
@@ -87,10 +94,10 @@ def test_the_command_line_tells_counts_and_what_comes_next(
 # the split
 
 
-def test_the_split_is_drawn_by_image_and_always_the_same(tmp_path: Path) -> None:
+def test_drawn_split_repeats_for_same_seed(tmp_path: Path) -> None:
     root = tmp_path / "source"
     for seed in range(10):
-        toys.picture(root / f"{seed}.png", seed)
+        toys.draw_image(root / f"{seed}.png", seed)
         toys.labelme_file(root / f"{seed}.json", [toys.shape("person", "polygon", toys.PERSON)])
     runs = []
     for i, (val, seed) in enumerate([(0.2, 0), (0.2, 0), (0.2, 1), (0.001, 0), (0.999, 0)]):
@@ -115,7 +122,7 @@ def test_folders_named_train_and_val_are_a_split(tmp_path: Path, format: str, fo
         assert all(image.path.is_file() for image in splits[name].images)
 
 
-def test_same_names_in_different_folders_keep_them(tmp_path: Path) -> None:
+def test_images_of_same_name_keep_their_folders(tmp_path: Path) -> None:
     root = tmp_path / "source"
     toys.labelme(root / "one")
     toys.labelme(root / "two" / "deep")
@@ -130,14 +137,14 @@ def test_same_names_in_different_folders_keep_them(tmp_path: Path) -> None:
             assert image.path.samefile(root / name)
 
 
-def test_sub_paths_that_the_layout_would_misread_are_refused(tmp_path: Path) -> None:
+def test_image_folders_that_would_be_misread_are_refused(tmp_path: Path) -> None:
     root = toys.yolo(
         tmp_path / "source", "train: images\nval: images/train/train\nnames: [person, car]\n"
     )
     for split in ("train/train", "train"):
-        toys.picture(root / "images" / split / "a.png", 1)
+        toys.draw_image(root / "images" / split / "a.png", 1)
         toys.write(root / "labels" / split / "a.txt", toys.yolo_row(0, toys.PERSON))
-    toys.picture(root / "images" / "train" / "train" / "train" / "a.png", 1)
+    toys.draw_image(root / "images" / "train" / "train" / "train" / "a.png", 1)
     with pytest.raises(DataError, match="images/train would be taken for others of the same name"):
         convert("yolo", root, tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
@@ -163,7 +170,7 @@ def test_nothing_is_left_when_writing_fails(
     assert sorted(source.rglob("*")) == before
 
 
-def test_a_full_folder_is_refused_and_an_empty_one_taken(tmp_path: Path) -> None:
+def test_output_folder_must_be_empty(tmp_path: Path) -> None:
     source = toys.yolo(tmp_path / "source")
     out = tmp_path / "out"
     toys.write(out / "mine.txt", "keep")
@@ -206,7 +213,7 @@ JUNK = st.sampled_from(
 
 
 def places(value: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The ways to every value inside of a JSON value."""
+    """Yield the path to every value inside a JSON value."""
     pairs = (
         value.items()
         if isinstance(value, dict)
@@ -219,7 +226,7 @@ def places(value: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @settings(max_examples=60, deadline=None)
 @given(format=st.sampled_from(["labelme", "via"]), data=st.data())
-def test_json_damaged_anywhere_is_converted_or_named(format: Any, data: st.DataObject) -> None:
+def test_damaged_json_is_converted_or_named_in_error(format: Any, data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = BUILD[format](Path(folder) / "source")
         path = root / ("via.json" if format == "via" else "a.json")
@@ -240,25 +247,31 @@ def test_json_damaged_anywhere_is_converted_or_named(format: Any, data: st.DataO
         assert not said or (str(root) in said and "\n" not in said)
 
 
-def test_errors_of_any_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_conversion_error_names_file_for_every_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = toys.labelme(tmp_path / "source")
-    refused(tmp_path, "labelme", tmp_path / "gone", r"gone: no such file or folder$")
-    refused(
+    assert_refused(tmp_path, "labelme", tmp_path / "gone", r"gone: no such file or folder$")
+    assert_refused(
         tmp_path, "labelme", tmp_path, r"--attribute is for via, not for labelme$", attribute="x"
     )
-    refused(tmp_path, "yolo", tmp_path, r"--names is for voc and via, not for yolo$", names=root)
-    refused(tmp_path, "labelme", root / "a.json", r"a\.json: 1 image; two or more are needed")
-    refused(tmp_path, "labelme", root, r"--val 1\.0: must be between 0 and 1$", val=1.0)
-    refused(tmp_path, "voc", root, r"none\.txt: no such file$", names=tmp_path / "none.txt")
+    assert_refused(
+        tmp_path, "yolo", tmp_path, r"--names is for voc and via, not for yolo$", names=root
+    )
+    assert_refused(
+        tmp_path, "labelme", root / "a.json", r"a\.json: 1 image; two or more are needed"
+    )
+    assert_refused(tmp_path, "labelme", root, r"--val 1\.0: must be between 0 and 1$", val=1.0)
+    assert_refused(tmp_path, "voc", root, r"none\.txt: no such file$", names=tmp_path / "none.txt")
     (tmp_path / "empty").mkdir()
-    refused(tmp_path, "via", tmp_path / "empty", r"empty: no JSON file below it$")
+    assert_refused(tmp_path, "via", tmp_path / "empty", r"empty: no JSON file below it$")
     for name in toys.NAMES[:3]:
         toys.labelme_file(root / f"{name}.json", [toys.shape("x", "point", [1, 2])])
-    refused(
+    assert_refused(
         tmp_path,
         "labelme",
         root,
-        r"source: no object in train of 3 images; 3 left out: shape of type 'point'$",
+        r"source: no object in train of 3 images; 3 skipped: shape of type 'point'$",
         seed=seed_drawing_d(root),
     )
     assert main(["data", "convert", "labelme", str(tmp_path / "gone"), str(tmp_path / "out")]) == 1
@@ -269,5 +282,5 @@ def test_errors_of_any_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def seed_drawing_d(root: Path) -> int:
-    """A seed for which d.png, the fourth of four, is the validation image."""
+    """Return a seed for which d.png, the fourth of four, is the validation image."""
     return next(seed for seed in range(99) if np.random.default_rng(seed).permutation(4)[0] == 3)

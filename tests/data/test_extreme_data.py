@@ -1,6 +1,4 @@
-"""Data that is legal and hard: hundreds of objects, none, single pixels, a panorama; no crash,
-bounded memory.
-"""
+"""Extreme but legal data trains in bounded memory: many objects, none, single pixels, panoramas."""
 
 import subprocess
 import sys
@@ -33,7 +31,8 @@ torch.set_num_threads(1)
 torch.manual_seed(0)
 canvas = (96, 256)
 data = CocoDataModule(sys.argv[1], canvas=canvas, batch_size=2, workers=0)
-config = dict(depth=18, width=0.125, fpn_channels=8, fc=16, anchor_scales=(8, 16, 32, 64), score_threshold=0.0)
+sizes = dict(depth=18, width=0.125, fpn_channels=8, fc=16)
+config = dict(anchor_scales=(8, 16, 32, 64), score_threshold=0.0, **sizes)
 network = MaskRCNN(2, NetworkConfig(canvas=canvas, rois=128, detections=100, **config))
 before = peak()
 data.setup("fit")
@@ -59,8 +58,9 @@ print(objects, trained - before, peak() - before)
 def folder(
     root: Path, images: list[list[tuple[int, int, int, int]]], size: tuple[int, int]
 ) -> Path:
-    """A folder whose two splits are the same images of a size (height, width), px; images: the
-    boxes of each.
+    """Write a folder whose two splits are the same images.
+
+    size: (height, width), px; images: the boxes of each.
     """
     (root / "images").mkdir(parents=True)
     files: list[dict[str, Any]] = []
@@ -80,7 +80,7 @@ def folder(
 
 
 def train(root: Path) -> tuple[int, int, int]:
-    """Objects trained on; growth of the peak memory in training, and with validation, MiB."""
+    """Return the number of objects, and the growth of peak memory by training and in all, MiB."""
     done = subprocess.run(
         [sys.executable, "-c", _TRAIN, str(root)], capture_output=True, text=True, timeout=300
     )

@@ -1,6 +1,4 @@
-"""`cohdc data tum` against a host of its own: download, resumption, checks, and archives that must
-not be unpacked.
-"""
+"""`cohdc data tum` against a local host: download, resumption, checks, unsafe archives."""
 
 import hashlib
 import io
@@ -41,7 +39,7 @@ def archive(files: dict[str, bytes], *extra: tarfile.TarInfo) -> bytes:
 
 
 class Host(BaseHTTPRequestHandler):
-    """Gives one file, from a byte on when asked to; breaks off behind `breaks` bytes."""
+    """Serves one file, from a byte on when asked to, and stops after `breaks` bytes."""
 
     content = b""
     breaks: ClassVar[int | None] = None
@@ -81,7 +79,7 @@ def host() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("name", ["walking_xyz", "freiburg3_walking_xyz", NAME])
-def test_a_sequence_is_fetched_checked_and_unpacked(tmp_path: Path, host: str, name: str) -> None:
+def test_sequence_is_fetched_checked_and_unpacked(tmp_path: Path, host: str, name: str) -> None:
     folder = tum(name, out=tmp_path / "tum", host=host)
     assert folder == tmp_path / "tum" / NAME
     assert {file: (folder / file).read_bytes() for file in FILES} == FILES
@@ -89,13 +87,13 @@ def test_a_sequence_is_fetched_checked_and_unpacked(tmp_path: Path, host: str, n
     assert len(Host.asked) == 1, "what is there is not fetched again"
 
 
-def test_a_part_that_is_too_long_is_fetched_anew(tmp_path: Path, host: str) -> None:
+def test_part_that_is_too_long_is_fetched_again(tmp_path: Path, host: str) -> None:
     (tmp_path / f"{NAME}.tgz.part").write_bytes(b"x" * (len(Host.content) + 1))
     tum("walking_xyz", out=tmp_path, host=host)
     assert (tmp_path / f"{NAME}.tgz").read_bytes() == Host.content
 
 
-def test_what_the_host_gives_instead_of_an_archive_is_not_kept(tmp_path: Path, host: str) -> None:
+def test_answer_that_is_no_archive_is_deleted(tmp_path: Path, host: str) -> None:
     Host.content = b"<html>please log in</html>"
     with pytest.raises(
         DataError, match=r"not a whole \.tgz: not a gzip file; it was deleted"
@@ -105,7 +103,7 @@ def test_what_the_host_gives_instead_of_an_archive_is_not_kept(tmp_path: Path, h
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_archive_that_was_not_fetched_now_is_kept(tmp_path: Path, host: str) -> None:
+def test_archive_of_user_is_kept_on_failure(tmp_path: Path, host: str) -> None:
     (tmp_path / f"{NAME}.tgz").write_bytes(b"fetched by hand, cut off")
     with pytest.raises(DataError, match=r"not a whole \.tgz: .*; delete it to fetch it again"):
         tum("walking_xyz", out=tmp_path, host=host)
@@ -114,7 +112,7 @@ def test_an_archive_that_was_not_fetched_now_is_kept(tmp_path: Path, host: str) 
 
 
 @pytest.mark.parametrize("ranges", [True, False])
-def test_a_download_goes_on_where_it_was_cut_off(tmp_path: Path, host: str, ranges: bool) -> None:
+def test_interrupted_download_continues(tmp_path: Path, host: str, ranges: bool) -> None:
     Host.breaks = 100
     with pytest.raises(DataError, match=r"100 of \d+ bytes arrived|cannot be fetched"):
         tum("walking_xyz", out=tmp_path, host=host)
@@ -128,7 +126,9 @@ def test_a_download_goes_on_where_it_was_cut_off(tmp_path: Path, host: str, rang
     )
 
 
-def test_offline_it_says_what_to_fetch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_offline_error_names_url_and_archive_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = ["walking_xyz", "--out", str(tmp_path), "--host", "http://127.0.0.1:1"]
     assert main(["data", "tum", *arguments]) == 1
     said = capsys.readouterr().err.strip()
@@ -140,7 +140,7 @@ def test_offline_it_says_what_to_fetch(tmp_path: Path, capsys: pytest.CaptureFix
     assert list(tmp_path.iterdir()) == []
 
 
-def refused(tmp_path: Path, content: bytes, message: str, **options: Any) -> None:
+def assert_refused(tmp_path: Path, content: bytes, message: str, **options: Any) -> None:
     file = tmp_path / "given.tgz"
     file.write_bytes(content)
     with pytest.raises(DataError, match=message):
@@ -150,23 +150,25 @@ def refused(tmp_path: Path, content: bytes, message: str, **options: Any) -> Non
 
 def test_damaged_and_incomplete_archives_leave_nothing(tmp_path: Path) -> None:
     whole = archive(FILES)
-    refused(tmp_path, whole[: len(whole) // 2], r"given\.tgz: not a whole \.tgz")
-    refused(tmp_path, b"no archive", r"given\.tgz: not a whole \.tgz")
-    refused(
+    assert_refused(tmp_path, whole[: len(whole) // 2], r"given\.tgz: not a whole \.tgz")
+    assert_refused(tmp_path, b"no archive", r"given\.tgz: not a whole \.tgz")
+    assert_refused(
         tmp_path,
         archive({k: v for k, v in FILES.items() if k != "rgb/2.0.png"}),
         r"rgb\.txt line 3: '2\.0 rgb/2",
     )
-    refused(
+    assert_refused(
         tmp_path,
         archive({k: v for k, v in FILES.items() if k != "groundtruth.txt"}),
         r"no groundtruth\.txt",
     )
-    refused(tmp_path, archive(FILES | {"rgb.txt": b"\xff\xfe"}), r"given\.tgz: rgb\.txt is no text")
-    refused(
+    assert_refused(
+        tmp_path, archive(FILES | {"rgb.txt": b"\xff\xfe"}), r"given\.tgz: rgb\.txt is no text"
+    )
+    assert_refused(
         tmp_path, archive(FILES | {"rgb.txt": b"", "depth.txt": b""}), "its lists name no image"
     )
-    refused(tmp_path, whole, "SHA-256 [0-9a-f]{64}, expected 00", digest="00")
+    assert_refused(tmp_path, whole, "SHA-256 [0-9a-f]{64}, expected 00", digest="00")
 
 
 def test_archives_that_lead_outside_are_refused(tmp_path: Path) -> None:
@@ -177,11 +179,11 @@ def test_archives_that_lead_outside_are_refused(tmp_path: Path) -> None:
     )
     link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
     for member in (up, absolute, link):
-        refused(tmp_path, archive(FILES, member), "is a link or leads out of the folder")
+        assert_refused(tmp_path, archive(FILES, member), "is a link or leads out of the folder")
     assert not (tmp_path / "evil").exists()
 
 
-def test_a_given_archive_needs_no_host_and_its_digest_may_be_asked_for(tmp_path: Path) -> None:
+def test_given_archive_needs_no_host_and_its_digest_may_be_asked_for(tmp_path: Path) -> None:
     file = tmp_path / "given.tgz"
     file.write_bytes(archive(FILES))
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -195,9 +197,14 @@ def test_a_given_archive_needs_no_host_and_its_digest_may_be_asked_for(tmp_path:
     assert (folder / "rgb.txt").is_file()
 
 
-def test_unknown_and_ambiguous_names_list_what_there_is() -> None:
+def test_unknown_and_ambiguous_names_list_sequences() -> None:
     with pytest.raises(DataError, match="'running_xyz': there are freiburg1_xyz, "):
         tum("running_xyz")
     with pytest.raises(DataError, match="'xyz': is freiburg1_xyz, freiburg2_xyz"):
         tum("xyz")
     assert len(set(SEQUENCES)) == len(SEQUENCES)
+
+
+def test_entry_without_content_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tarfile.TarFile, "extractfile", lambda *_: None)
+    assert_refused(tmp_path, archive(FILES), r"given\.tgz: entry '.*' has no content")

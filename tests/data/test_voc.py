@@ -1,18 +1,18 @@
-"""Pascal VOC segmentation: majorities, void, colours, names, and every mistake named."""
+"""Pascal VOC segmentation: majorities, void, colors, names, and named errors."""
 
 from pathlib import Path
 
 import foreign_toys as toys
 import numpy as np
 import pytest
-from conversion import converted, image_of, masks_of, refused
+from conversion import assert_refused, converted, image_of, masks_of
 from PIL import Image
 
 from cohdc_train.data.convert import convert
 from cohdc_train.errors import DataError
 
 
-def test_voc_the_majority_names_an_object_and_void_is_nothing(
+def test_voc_class_is_majority_and_void_is_background(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = toys.voc(tmp_path / "source")
@@ -36,12 +36,17 @@ def test_voc_the_majority_names_an_object_and_void_is_nothing(
     )
 
 
-LABELMAP = "# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:10,20,30::\nperson:200,10,0:head,foot:run\n"
+LABELMAP = """\
+# label:color_rgb:parts:actions
+background:0,0,0::
+car:10,20,30::
+person:200,10,0:head,foot:run
+"""
 
 
 @pytest.mark.parametrize("palette", [True, False])
-def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
-    """As CVAT writes it: no split, PNGs of colours, images of any type in sub folders."""
+def test_voc_reads_colors_of_labelmap(tmp_path: Path, palette: bool) -> None:
+    """CVAT writes no split, PNGs of colors, and images of any type in subfolders."""
     root = tmp_path / "source"
     objects, classes = toys.voc_labels()
     paints = {
@@ -53,11 +58,11 @@ def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
         2: (0, 128, 0),
     }
     for seed, name in enumerate(("day/a", "night/b", "night/c")):
-        toys.picture(root / "JPEGImages" / f"{name}.png", seed)
+        toys.draw_image(root / "JPEGImages" / f"{name}.png", seed)
         for folder, values in (("SegmentationObject", objects), ("SegmentationClass", classes)):
             rgb = np.zeros((*values.shape, 3), np.uint8)
-            for value, colour in paints.items():
-                rgb[values == value] = colour
+            for value, color in paints.items():
+                rgb[values == value] = color
             image = Image.fromarray(rgb)
             path = root / folder / f"{name}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,11 +76,11 @@ def test_voc_colours_of_a_labelmap(tmp_path: Path, palette: bool) -> None:
         assert np.array_equal(found["car"], toys.box_mask(*toys.CAR))
         assert np.array_equal(found["person"], toys.box_mask(5, 4, 25, 30))
     toys.write(root / "labelmap.txt", LABELMAP.replace("200,10,0", "200,10,1"))
-    with pytest.raises(DataError, match=r"a\.png: colour 200,10,0 is no class's$"):
+    with pytest.raises(DataError, match=r"a\.png: color 200,10,0 is no class's$"):
         convert("voc", root, tmp_path / "out")
 
 
-def test_voc_names_of_a_file_number_the_classes(tmp_path: Path) -> None:
+def test_voc_class_ids_follow_names_file(tmp_path: Path) -> None:
     root = toys.voc(tmp_path / "source")
     lines = ["__ignore__", "_background_", *(f"class {i}" for i in range(1, 16))]
     splits = converted("voc", root, names=toys.write(tmp_path / "names.txt", "\n".join(lines)))
@@ -105,7 +110,7 @@ VOC_ERRORS = {
     r"SegmentationObject/a\.png: a PNG of mode I;16; a palette": lambda r: Image.fromarray(
         np.ones((toys.HEIGHT, toys.WIDTH), np.uint16)
     ).save(r / "SegmentationObject" / "a.png"),
-    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.picture(
+    r"a\.jpg: is 10x10, its annotation 64x48$": lambda r: toys.draw_image(
         r / "JPEGImages" / "a.jpg", 1, (10, 10)
     ),
     r"labelmap\.txt:2: not name:R,G,B$": lambda r: toys.write(
@@ -114,7 +119,7 @@ VOC_ERRORS = {
     r"labelmap\.txt:2: class 'a' is listed twice$": lambda r: toys.write(
         r / "labelmap.txt", "a:1,2,3::\na:4,5,6::\n"
     ),
-    r"labelmap\.txt:2: b has the colour of a$": lambda r: toys.write(
+    r"labelmap\.txt:2: b has the color of a$": lambda r: toys.write(
         r / "labelmap.txt", "a:1,2,3::\nb:1,2,3::\n"
     ),
     r"labelmap\.txt: 0 classes; 1 to 254": lambda r: toys.write(
@@ -124,7 +129,7 @@ VOC_ERRORS = {
 
 
 @pytest.mark.parametrize("message", VOC_ERRORS)
-def test_voc_errors(tmp_path: Path, message: str) -> None:
+def test_voc_error_names_file_and_line(tmp_path: Path, message: str) -> None:
     root = toys.voc(tmp_path / "source")
     VOC_ERRORS[message](root)
-    refused(tmp_path, "voc", root, message)
+    assert_refused(tmp_path, "voc", root, message)

@@ -1,4 +1,4 @@
-"""Every layout and format that the loader takes, and every mistake it names."""
+"""Layouts and segmentations that the COCO loader reads, and the errors it names."""
 
 import copy
 import json
@@ -29,7 +29,7 @@ PERSON, CAR = 1, 2  # labels: categories are sorted by id, 10 and 20
 
 
 def split_of(tmp_path: Path, change: Any = None, classes: list[str] | None = None) -> CocoSplit:
-    """Three drawn images, their annotations changed by a function."""
+    """Write three drawn images whose annotations a function has changed."""
     value = toys.content(tmp_path / "images", "train", 3)
     value = copy.deepcopy(value)
     if change is not None:
@@ -104,7 +104,7 @@ def test_polygons_and_both_rle_give_the_same_mask(tmp_path: Path) -> None:
         assert np.array_equal(got, expected)
 
 
-def test_the_class_filter_remaps_and_counts_classes(tmp_path: Path) -> None:
+def test_class_filter_remaps_and_counts_classes(tmp_path: Path) -> None:
     whole = split_of(tmp_path)
     assert whole.class_names == ("person", "car")
     assert labels(whole) == [PERSON, CAR] * 3
@@ -144,7 +144,7 @@ def test_degenerate_objects_are_dropped_and_counted(tmp_path: Path) -> None:
     assert labels(split) == [CAR]
 
 
-def test_what_reaches_out_of_the_image_is_cut_off(tmp_path: Path) -> None:
+def test_objects_are_clipped_to_image(tmp_path: Path) -> None:
     def change(value: dict[str, Any]) -> None:
         polygon = [-10, -10, 20, -10, 20, 30, -10, 30]
         value["annotations"][0].update(bbox=[-10, -10, 30, 40], segmentation=[polygon])
@@ -158,7 +158,7 @@ def test_what_reaches_out_of_the_image_is_cut_off(tmp_path: Path) -> None:
     assert mask.sum() == 600
 
 
-def test_a_missing_box_comes_from_the_contour(tmp_path: Path) -> None:
+def test_missing_box_comes_from_the_contour(tmp_path: Path) -> None:
     split = split_of(tmp_path, lambda v: v["annotations"][0].pop("bbox"))
     assert split.images[0].objects[0].box == (3, 4, 16, 24)
 
@@ -188,7 +188,7 @@ def test_mistakes_are_named_in_one_line(tmp_path: Path, message: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_missing_folder_file_or_bracket_is_named(tmp_path: Path) -> None:
+def test_missing_folder_file_and_broken_json_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere: no such folder$"):
         find_split(tmp_path / "nowhere", "train")
     with pytest.raises(
@@ -203,7 +203,7 @@ def test_a_missing_folder_file_or_bracket_is_named(tmp_path: Path) -> None:
         read_split("train", SplitPaths(tmp_path / "gone.json", tmp_path))
 
 
-def test_train_and_val_agree_by_name_whatever_their_ids(tmp_path: Path) -> None:
+def test_train_and_val_labels_agree_by_class_name(tmp_path: Path) -> None:
     root = toys.folder(tmp_path)
     path = root / "instances_val.json"
     value = json.loads(path.read_text())
@@ -240,7 +240,7 @@ def test_subsets_are_the_same_every_time_and_nested(tmp_path: Path) -> None:
 
 def test_images_are_rgb_and_checked(tmp_path: Path) -> None:
     image = split_of(tmp_path).images[0]
-    assert tuple(read_image(image)[10, 10]) == toys.COLOURS[10]
+    assert tuple(read_image(image)[10, 10]) == toys.COLORS[10]
     wrong = split_of(tmp_path, lambda v: v["images"][0].update(height=64, width=48, id=1)).images[0]
     lost = r"48x64: swapped, or the file lost its EXIF orientation\?$"
     with pytest.raises(DataError, match=rf"image 1 is 64x48, its annotation {lost}"):
@@ -265,7 +265,7 @@ def test_stats_prints_the_counts(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "looked for" in capsys.readouterr().err
 
 
-def test_the_real_sets_hold_what_their_readme_says() -> None:
+def test_shared_sets_have_documented_counts() -> None:
     data = Path(__file__).parents[2] / ".." / "shared" / "data"
     if not data.is_dir():
         pytest.skip("the shared data are not here")
@@ -276,6 +276,6 @@ def test_the_real_sets_hold_what_their_readme_says() -> None:
     assert len(vehicles.val.images) == 88
 
 
-def test_the_verbs_of_data_need_no_torch() -> None:
+def test_data_verbs_need_no_torch() -> None:
     code = "import sys, cohdc_train.data.commands; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""Batches: shapes, types, ranges, and the same ones for the same seed."""
+"""Batches: shapes, types, ranges, and repeatability for a seed."""
 
 import json
 import subprocess
@@ -33,7 +33,7 @@ def test_classes_come_from_the_file(tmp_path: Path) -> None:
     ]
 
 
-def test_a_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
+def test_training_batch_has_the_promised_shapes(tmp_path: Path) -> None:
     data = module(toys.folder(tmp_path))
     torch.manual_seed(1)
     batches = list(data.train_dataloader())
@@ -112,7 +112,7 @@ def test_validation_images_are_untouched(tmp_path: Path) -> None:
     (batch,) = list(data.val_dataloader())
     assert [image_id for _, image_id in batch] == [1, 2]
     assert batch[0][0].shape == (3, toys.HEIGHT, toys.WIDTH)
-    assert tuple(batch[0][0][:, 30, 40].tolist()) == toys.COLOURS[10]
+    assert tuple(batch[0][0][:, 30, 40].tolist()) == toys.COLORS[10]
     assert data.on_after_batch_transfer(batch, 0) is batch
 
 
@@ -120,7 +120,7 @@ def test_validation_images_are_untouched(tmp_path: Path) -> None:
     "ignore:This DataLoader will create 2 worker processes"
 )  # torch's advice on one core
 @pytest.mark.parametrize("workers", [0, 2])
-def test_the_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
+def test_same_seed_gives_the_same_batches(tmp_path: Path, workers: int) -> None:
     root = toys.folder(tmp_path)
     runs = []
     for seed in (5, 5, 6):
@@ -152,7 +152,8 @@ data = CocoDataModule(sys.argv[1], canvas=(256, 384), batch_size=1, workers=0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 torch.manual_seed(0)
 batch = next(iter(data.train_dataloader()))
-network = MaskRCNN(2, NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384)))
+config = NetworkConfig(depth=18, width=0.25, fpn_channels=16, fc=32, canvas=(256, 384))
+network = MaskRCNN(2, config)
 losses = network.losses(batch.images.float() / 255, batch.targets)
 sum(losses.values()).backward()
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -181,17 +182,17 @@ def test_hundreds_of_objects_on_a_large_image_take_little_memory(tmp_path: Path)
     assert mebibytes < 1000
 
 
-def test_cutouts_are_pasted_and_not_trained_on(tmp_path: Path) -> None:
-    pictures, others = toys.folder(tmp_path / "a", train=2), toys.folder(tmp_path / "b", train=5)
+def test_paste_roots_are_pasted_and_not_trained_on(tmp_path: Path) -> None:
+    root, others = toys.folder(tmp_path / "a", train=2), toys.folder(tmp_path / "b", train=5)
     augment = Augmentation(copy_paste=1.0, scale_jitter=(1.0, 1.0))
-    data = module(pictures, cutouts=[others], augment=augment)
-    assert len(data.givers) == 2
+    data = module(root, paste_roots=[others], augment=augment)
+    assert len(data.paste_sources) == 2
     (batch,) = list(data.train_dataloader())
     assert sorted(target["image_id"] for target in batch.targets) == [1, 2]
     with pytest.raises(DataError, match="pasted nowhere"):
-        module(pictures, cutouts=[others])
+        module(root, paste_roots=[others])
     rows = json.loads((others / "instances_train.json").read_text())
     rows["categories"][0]["name"] = "lorry"
     toys.write(others / "instances_train.json", rows)
     with pytest.raises(DataError, match="lorry"):
-        _ = module(pictures, cutouts=[others], augment=augment).givers
+        _ = module(root, paste_roots=[others], augment=augment).paste_sources
