@@ -86,6 +86,9 @@ def evaluate(
     if out is not None:
         out = Path(out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        files = {"groundtruth": str(groundtruth.resolve()), "estimate": str(estimate.resolve())}
+        files = {
+            "groundtruth": str(Path(groundtruth).resolve()),
+            "estimate": str(Path(estimate).resolve()),
+        }
         write_json(out, {**result, **files})  # `cohdc report` draws what lies there
     return result
