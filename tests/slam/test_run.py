@@ -69,7 +69,7 @@ def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
 def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequence: Path) -> None:
     names = {path.name for path in masked.iterdir()}
     tables = {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", MANIFEST}
-    assert names == tables | {"map.ply", "map.png", "pictures"}
+    assert names == tables | {"map.ply", "map.png", "pictures", "report.html"}
     assert [path.name for path in masked.parent.iterdir()] == ["run"], "no temporary folder is left"
     trajectory, truth = (
         Trajectory.load_tum(masked / "trajectory.txt"),

@@ -209,7 +209,7 @@ def test_camera_of_the_caller_is_tracked(tmp_path: Path) -> None:
 
 
 class RealSense(ModuleType):
-    """Stand-in for pyrealsense2, as docs/how-to/live-camera.md uses it, with a camera of five frames."""
+    """Stand-in for pyrealsense2 as the how-to page uses it: a camera of five frames."""
 
     def __init__(self) -> None:
         super().__init__("pyrealsense2")
