@@ -187,7 +187,8 @@ def test_without_masks_or_geometry_the_passer_by_spoils_it(
     )
     assert metrics["ate_m"]["rmse"] > 5 * good
     assert metrics["ms"]["segment"]["p95"] == 0
-    assert len(list((tmp_path / "pictures").iterdir())) == 6
+    assert len(list((tmp_path / "pictures").glob("*_before.jpg"))) == 6
+    assert not list((tmp_path / "pictures").glob("*_after.jpg"))
 
 
 def test_run_keeps_files_it_did_not_write(
