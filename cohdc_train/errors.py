@@ -1,14 +1,12 @@
-"""What a user can do wrong. Everything else is a bug and keeps its traceback."""
+"""Errors of users. Every other exception is a bug and keeps its traceback."""
 
 
 class CohdcError(Exception):
-    """A user's error, told in one line that names the file and the number; `cohdc` prints it and
-    exits 1.
-    """
+    """A user's error: one line that names file and number. `cohdc` prints it and exits with 1."""
 
 
 class DataError(CohdcError):
-    """An annotation file, an image, a sequence or a trajectory cannot be used as it is."""
+    """An annotation file, an image, a sequence or a trajectory cannot be used."""
 
 
 class ContractError(CohdcError):
@@ -16,10 +14,8 @@ class ContractError(CohdcError):
 
 
 class ExportError(CohdcError):
-    """An exported file did not equal the network it came from; nothing was left on disk."""
+    """An exported file does not equal the network that it came from. Nothing was left on disk."""
 
 
 class MissingExtraError(CohdcError):
-    """A verb needs packages of an extra that is not installed; the message holds the command that
-    installs it.
-    """
+    """A verb needs packages that are not installed; the message gives the install command."""

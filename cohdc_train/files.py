@@ -1,4 +1,4 @@
-"""Files and folders that are written whole or not at all, and never over a user's own."""
+"""Write files and folders whole or not at all, and never over a user's own."""
 
 import hashlib
 import json
@@ -17,8 +17,13 @@ _SHOWN = 5  # names in a refusal
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write to a name beside `path`, then rename: a reader sees the old file or the new one, never
-    a part.
+    """Write a file whole or not at all.
+
+    The content goes to another name in the same folder first, which is then renamed. A reader sees
+    the old file or the new one, never a part.
+
+    Raises:
+        DataError: the file cannot be written.
     """
     temporary = path.with_name(path.name + ".part")
     try:
@@ -30,17 +35,17 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """`write_bytes` of UTF-8 text."""
+    """Write UTF-8 text whole or not at all, as `write_bytes` does."""
     write_bytes(path, text.encode())
 
 
 def write_json(path: Path, content: Any) -> None:
-    """`write_text` of indented JSON."""
+    """Write indented JSON whole or not at all, as `write_bytes` does."""
     write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 def link_or_copy(path: Path, target: Path) -> None:
-    """Make `target` the same file, or a copy of it on another disk or a file system without links."""
+    """Make `target` a hard link to a file, or a copy where links are not possible."""
     try:
         os.link(path.resolve(), target)
     except OSError:
@@ -48,7 +53,11 @@ def link_or_copy(path: Path, target: Path) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal digest of a file's content. Raises DataError when there is no such file."""
+    """Return the hexadecimal SHA-256 digest of a file.
+
+    Raises:
+        DataError: there is no such file.
+    """
     if not path.is_file():
         raise DataError(f"{path}: no such file")
     with path.open("rb") as stream:
@@ -57,10 +66,10 @@ def sha256(path: Path) -> str:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `out` when the block ends well and vanishes when it
-    does not.
+    """Yield a temporary folder that becomes `out` when the block succeeds, and else is removed.
 
-    Raises DataError when `out` is a file or a folder with something in it.
+    Raises:
+        DataError: `out` is a file, or a folder with something in it.
     """
     if out.is_dir():
         count = sum(1 for _ in out.iterdir())
@@ -112,19 +121,22 @@ def claim_folder(folder: Path, verb: str, names: Collection[str], option: str = 
 
 
 class OwnFiles:
-    """Files that a run writes into a folder one by one; its block's end lists them in the manifest.
+    """Files that a run writes into a folder one by one; the block's end lists them in the manifest.
 
-    For names that are not known before the run; those that are go through `claim_folder` first.
+    It serves names that are not known before the run. Known names go through `claim_folder` first.
     """
 
     def __init__(self, folder: Path, verb: str) -> None:
+        """Read the names that the folder's manifest lists for a verb."""
         self._folder, self._verb = folder, verb
         self._names = listed_files(folder, verb)
 
     def __enter__(self) -> Self:
+        """Begin to write files."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """List all files that were written in the manifest."""
         list_files(self._folder, self._verb, self._names)
 
     def path(self, name: str) -> Path:
@@ -139,13 +151,14 @@ class OwnFiles:
 def listed_files(folder: Path, verb: str) -> set[str]:
     """Return the names that a folder's manifest lists for a verb; none without a manifest.
 
-    Raises DataError when the manifest is not one of this project's.
+    Raises:
+        DataError: the manifest was not written by this project.
     """
     return set(_read_manifest(folder).get(verb, ()))
 
 
 def list_files(folder: Path, verb: str, names: Iterable[str]) -> None:
-    """Add names to those that a folder's manifest lists for a verb. Makes the folder."""
+    """Add names to those that a folder's manifest lists for a verb, and make the folder."""
     _write_listed(folder, verb, listed_files(folder, verb) | set(names))
 
 
@@ -156,10 +169,18 @@ def files_below(folder: Path) -> list[str]:
 
 
 def publish(draft: Path, folder: Path, verb: str) -> list[str]:
-    """Move the files of `draft` into a folder, in place of all that a former run of the verb left.
+    """Move the files of `draft` into a folder, in place of those that a former run left there.
 
-    Foreign files stay. Returns the names that were left in `draft` because a foreign file has them,
-    one that appeared after `check_folder` for instance.
+    Files of others stay.
+
+    Args:
+        draft: the new files.
+        folder: where they go.
+        verb: whose files are replaced.
+
+    Returns:
+        Names that were left in `draft` because a file of somebody else has them, for example one
+        that appeared after `check_folder`.
     """
     former = listed_files(folder, verb)
     made = files_below(draft)
@@ -176,14 +197,14 @@ def publish(draft: Path, folder: Path, verb: str) -> list[str]:
 
 
 def remove_listed(folder: Path, verb: str) -> None:
-    """Remove the files that a folder's manifest lists for a verb, and the folders this empties."""
+    """Remove the files that a folder's manifest lists for a verb, and folders that become empty."""
     _remove(folder, listed_files(folder, verb))
     if folder.is_dir():
         _write_listed(folder, verb, ())
 
 
 def _is_foreign(folder: Path, name: str, listed: Collection[str]) -> bool:
-    """Whether something of this name is there that was not listed."""
+    """Return whether something of this name is there that was not listed."""
     path = folder / name
     if path.is_dir() and not path.is_symlink():
         known = name in listed or any(entry.startswith(f"{name}/") for entry in listed)
@@ -192,7 +213,7 @@ def _is_foreign(folder: Path, name: str, listed: Collection[str]) -> bool:
 
 
 def _remove(folder: Path, names: Iterable[str]) -> None:
-    """Remove files, and the folders between them and `folder` that are empty then."""
+    """Remove files, and the folders between them and `folder` that become empty."""
     for name in names:
         path = folder / name
         if path.is_dir() and not path.is_symlink():
@@ -204,7 +225,11 @@ def _remove(folder: Path, names: Iterable[str]) -> None:
 
 
 def _read_manifest(folder: Path) -> dict[str, list[str]]:
-    """Return verb -> names. Raises DataError for a file that is no manifest or leads elsewhere."""
+    """Return verb -> names.
+
+    Raises:
+        DataError: the file is no manifest, or a name leads out of the folder.
+    """
     file = folder / MANIFEST
     try:
         content = json.loads(file.read_text(encoding="utf-8"))

@@ -1,7 +1,7 @@
-"""Read image files as viewers show them: upright, turned by their EXIF orientation (no torch).
+"""Read image files as viewers show them: turned by their EXIF orientation (no torch).
 
-This is the one reader of users' photographs. Annotation tools show the upright image, so labels
-are relative to it.
+This is the one reader of users' photographs. Annotation tools show the upright image, so labels are
+relative to it.
 """
 
 import io
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
 Size = tuple[int, int]  # width, height, px
 _BROKEN_EXIF = (LookupError, OSError, SyntaxError, TypeError, ValueError, struct.error)
 
@@ -43,15 +44,16 @@ def upright_size(stored: Size, orientation: int) -> Size:
 
 
 def is_read_as_stored(stored: Size, orientation: int, annotated: Size | None) -> bool:
-    """Whether an annotation can only be of the pixels as stored: only they have its size.
+    """Return whether an annotation can only be of the pixels as they are stored.
 
-    COCO's own annotations of images turned by 90 degrees are such. The image must not be turned.
+    That is so where only they have the annotated size, as in COCO's own annotations of images
+    turned by 90 degrees. Such an image must not be turned.
     """
     return annotated == stored != upright_size(stored, orientation)
 
 
 def turn_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """Return pixels [H, W, ...] turned and mirrored as an EXIF orientation 1..8 asks for."""
+    """Return pixels [H, W, ...] turned and mirrored as an EXIF orientation 1..8 tells."""
     if orientation >= 5:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -62,10 +64,12 @@ def turn_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint
 
 
 def read_rgb(path: Path, annotated: Size | None = None) -> NDArray[np.uint8] | None:
-    """Return an image file's pixels, uint8 [H, W, 3] RGB, upright; None when it cannot be decoded.
+    """Return the pixels of an image file, uint8 [H, W, 3] RGB, upright; None if it is not readable.
 
-    annotated: the size of the image that labels were drawn on. The pixels stay as they are stored
-    where `is_read_as_stored` says so.
+    Args:
+        path: the image file.
+        annotated: (width, height) of the image that labels were drawn on, px. The pixels stay as
+            they are stored where `is_read_as_stored` says so.
     """
     try:
         data = path.read_bytes()

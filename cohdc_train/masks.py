@@ -1,19 +1,24 @@
-"""RoI masks -> masks of the whole image: the one paste that training's scores, `predict` and SLAM
-share.
+"""Paste masks of regions of interest (RoIs) into masks of the whole image.
+
+Training's scores, `cohdc predict` and SLAM share this one paste.
 """
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from cohdc_train.types import Float32Array, Mask
 
 
 def paste_roi_mask(
-    roi_mask: NDArray[np.float32],
-    box: NDArray[np.float32],
+    roi_mask: Float32Array,
+    box: Float32Array,
     size: tuple[int, int],
     threshold: float = 0.5,
-) -> NDArray[np.bool_]:
-    """One RoI mask laid over its box in the image: [height, width] bool. See `roi_window`."""
+) -> Mask:
+    """Return the mask of the whole image, [height, width] bool, for one RoI mask.
+
+    Arguments are those of `roi_window`.
+    """
     mask = np.zeros(size, dtype=np.bool_)
     window, (top, left) = roi_window(roi_mask, box, size, threshold)
     mask[top : top + window.shape[0], left : left + window.shape[1]] = window
@@ -21,21 +26,28 @@ def paste_roi_mask(
 
 
 def roi_window(
-    roi_mask: NDArray[np.float32],
-    box: NDArray[np.float32],
+    roi_mask: Float32Array,
+    box: Float32Array,
     size: tuple[int, int],
     threshold: float = 0.5,
-) -> tuple[NDArray[np.bool_], tuple[int, int]]:
-    """The part of the image's mask that lies in the box: [h, w] bool, and (row, column) of its
-    first pixel.
+) -> tuple[Mask, tuple[int, int]]:
+    """Return the part of the image's mask that lies in the box, and where it begins.
 
-    roi_mask: [M, M] probability; box: [4] xyxy, px; size: (height, width) of the image, px.
-    A pixel's centre is mapped into the RoI grid and sampled bilinearly; pixels whose centre lies
-    outside the box are no part of the mask.
+    A pixel's center is mapped into the RoI grid and sampled bilinearly. Pixels whose center lies
+    outside the box do not belong to the mask.
+
+    Args:
+        roi_mask: [M, M] probability.
+        box: [4] xyxy, px.
+        size: (height, width) of the image, px.
+        threshold: probability above which a pixel belongs to the mask.
+
+    Returns:
+        [h, w] bool, and (row, column) of its first pixel in the image.
     """
     height, width = size
     x0, y0, x1, y1 = (float(v) for v in box)
-    # pixels whose centre lies inside the box
+    # pixels whose center lies inside the box
     left, right = max(int(np.ceil(x0 - 0.5)), 0), min(int(np.ceil(x1 - 0.5)), width)
     top, bottom = max(int(np.ceil(y0 - 0.5)), 0), min(int(np.ceil(y1 - 0.5)), height)
     if right <= left or bottom <= top:

@@ -1,8 +1,7 @@
-"""The ONNX contract between the workstation that trains and the robot that runs: names, shapes,
-dtypes, units.
+"""ONNX contract between training and the robot: names, shapes, dtypes and units of the tensors.
 
 B images of one call share a height H and a width W, both free at run time. N (padded detections)
-and M (mask side) are fixed in the file. Rows at or after `count` are padding and hold zeros.
+and M (side of a mask) are fixed in the file. Rows from `count` on are padding and hold zeros.
 
 | tensor | dtype, shape | meaning |
 |---|---|---|
@@ -11,9 +10,10 @@ and M (mask side) are fixed in the file. Rows at or after `count` are padding an
 | labels | int64 [B, N] | index into the class names |
 | scores | float32 [B, N] | class score, falling |
 | quality | float32 [B, N] | CQE's estimate of the mask's IoU with the object, 0..1 |
-| masks | float32 [B, N, M, M] | of the box, cut at `KEY_THRESHOLDS`; cell (i, j) is centred (i +
-.5) / M of its side |
-| count | int64 [B] | how many leading rows are detections |
+| masks | float32 [B, N, M, M] | mask in its box, cut at `KEY_THRESHOLDS`; see below |
+| count | int64 [B] | number of leading rows that are detections |
+
+The center of a mask's cell (i, j) lies at (i + .5) / M and (j + .5) / M of the box's sides.
 """
 
 CONTRACT_VERSION = 1

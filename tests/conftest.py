@@ -1,4 +1,4 @@
-"""A network small enough for a test, with weights that give it opinions."""
+"""Fixtures: a small network whose random weights detect something."""
 
 import pytest
 import torch
@@ -25,9 +25,7 @@ SMALL = NetworkConfig(
 
 @pytest.fixture(scope="session")
 def opinionated():
-    """Random weights, scaled until boxes and masks differ from place to place, and no score is
-    saturated.
-    """
+    """Make a network with random weights, scaled until its outputs vary and do not saturate."""
     torch.manual_seed(0)
     network = MaskRCNN(2, SMALL).eval()
     with torch.no_grad():
@@ -39,5 +37,5 @@ def opinionated():
 
 @pytest.fixture
 def small_config():
-    """The shape of the small network."""
+    """Return the configuration of the small network."""
     return SMALL

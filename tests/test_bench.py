@@ -1,4 +1,4 @@
-"""Table 4: rows are cached, timed in turn, and written whole; a tiny bench runs from data to table."""
+"""`cohdc bench networks`: rows are cached, timed in turn, and written; a tiny bench runs."""
 
 import csv
 import json
@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import yaml
 
-from cohdc_train.bench import _fit_options, bench
-from cohdc_train.bench import rows as entries_module
-from cohdc_train.bench.rows import ROWS, Entry, row_config
-from cohdc_train.bench.speed import frame_rates, spread
-from cohdc_train.bench.table import _row, as_text, plot
-from cohdc_train.bench.training import call, train
+from cohdc_train.bench import rows as rows_module
+from cohdc_train.bench.comparison import make_row
+from cohdc_train.bench.networks import NetworkBenchOptions, bench_networks
+from cohdc_train.bench.rows import ROWS, ScoredNetwork, row_config
+from cohdc_train.bench.speed import Rate, frame_rates, median_and_range, peak_memory
+from cohdc_train.bench.table import format_table, plot_table
+from cohdc_train.bench.training import run_command, train
 from cohdc_train.errors import CohdcError
 from cohdc_train.segmenter import Detections
 
@@ -34,8 +35,9 @@ KEYS = {
 TINY = """
 data: {canvas: [48, 64]}
 model:
-  network: {width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16, proposals: [50, 20],
-            detections: 10}
+  network:
+    {width: 0.125, fpn_channels: 8, fc: 16, anchor_scales: [8, 16, 32, 64], rois: 16,
+     proposals: [50, 20], detections: 10}
 trainer: {accelerator: cpu, enable_model_summary: false}
 """
 
@@ -51,7 +53,7 @@ def nothing(rgb):
     return Detections(empty, *fields, rgb.shape[:2], ("person",))
 
 
-def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monkeypatch):
+def test_runners_take_turns_and_the_warmup_is_not_measured(monkeypatch):
     clock = [0.0]
     order = []
 
@@ -66,14 +68,14 @@ def test_runners_take_turns_on_every_picture_and_the_first_is_not_measured(monke
     monkeypatch.setattr(
         "cohdc_train.exporter.interleaved_timing.time.perf_counter", lambda: clock[0]
     )
-    pictures = [np.full((8, 8, 3), i, np.uint8) for i in range(3)]
-    rates = frame_rates({"slow": runner("slow", 0.5), "fast": runner("fast", 0.125)}, pictures)
+    images = [np.full((8, 8, 3), i, np.uint8) for i in range(3)]
+    rates = frame_rates({"slow": runner("slow", 0.5), "fast": runner("fast", 0.125)}, images)
     assert order == [(name, i) for i in (0, 0, 1, 2) for name in ("slow", "fast")]
     assert rates["slow"] == pytest.approx((2, 2, 2))
     assert rates["fast"] == pytest.approx((8, 8, 8))
 
 
-def entry(tmp_path: Path, seed: int | None, ap: float) -> Entry:
+def entry(tmp_path: Path, seed: int | None, ap: float) -> ScoredNetwork:
     files = {"fps_ort": tmp_path / "a.onnx"} | (
         {} if seed is None else {"fps_ort_int8": tmp_path / "b.onnx"}
     )
@@ -87,7 +89,7 @@ def entry(tmp_path: Path, seed: int | None, ap: float) -> Entry:
         "vertices": 20.0,
     }
     seconds = None if seed is None else 60.0 + 10 * seed
-    return Entry(
+    return ScoredNetwork(
         "row",
         seed,
         None,
@@ -97,9 +99,9 @@ def entry(tmp_path: Path, seed: int | None, ap: float) -> Entry:
     )
 
 
-def test_a_row_holds_medians_over_seeds_ranges_and_null_where_there_is_nothing(tmp_path):
+def test_row_holds_medians_ranges_and_none_for_missing_values(tmp_path):
     rates = {"fps_ort": (4.0, 3.0, 5.0), "fps_ort_int8": (8.0, 7.0, 9.0)}
-    row = _row(
+    row = make_row(
         "ours",
         [entry(tmp_path, s, ap) for s, ap in enumerate((0.3, 0.5, 0.4))],
         _rates(rates),
@@ -111,41 +113,47 @@ def test_a_row_holds_medians_over_seeds_ranges_and_null_where_there_is_nothing(t
     assert row["s90_matched"] is None
     assert row["fps_torch"] is None
     assert row["model_mb"] == 2.5
-    foreign = _row(
+    foreign = make_row(
         "peer.onnx", [entry(tmp_path, None, 0.2)], _rates({"fps_ort": (4.0, 3.0, 5.0)}), 99.0
     )
     assert foreign["train_seconds"] is foreign["fps_ort_int8"] is foreign["ap_int8"] is None
-    text = as_text([row, foreign], "a machine")
+    text = format_table([row, foreign], "a machine")
     assert "0.400 (0.300-0.500)" in text
     assert "4.00 (3.00-5.00)" in text
     assert text.splitlines()[3].startswith("| peer.onnx | - | - | 4.00")
     assert text.endswith("a machine\n")
-    assert plot([row, foreign]).startswith(b"\x89PNG")
+    assert plot_table([row, foreign]).startswith(b"\x89PNG")
 
 
 def _rates(values):
-    from cohdc_train.bench.speed import Rate
-
     return {name: Rate(*rate) for name, rate in values.items()}
 
 
-def test_spread_is_median_and_range():
-    assert spread([3.0, 1.0, 10.0]) == (3.0, 1.0, 10.0)
+def test_median_and_range():
+    assert median_and_range([3.0, 1.0, 10.0]) == (3.0, 1.0, 10.0)
 
 
-def test_the_budget_is_epochs_or_minutes():
-    assert _fit_options(Path("c.yaml"), ["--x=1"], 3, None) == (
-        "--config=c.yaml",
-        "--x=1",
-        "--trainer.max_epochs=3",
-    )
-    assert _fit_options(None, [], None, 90.5) == (
+def test_budget_is_epochs_or_minutes():
+    by_epochs = NetworkBenchOptions(fit_config=Path("c.yaml"), options=["--x=1"], epochs=3)
+    assert by_epochs.fit_arguments() == ("--config=c.yaml", "--x=1", "--trainer.max_epochs=3")
+    by_time = NetworkBenchOptions(train_minutes=90.5)
+    assert by_time.fit_arguments() == (
         "--trainer.max_time=00:01:30:30",
         "--trainer.max_epochs=-1",
     )
-    for epochs, minutes in ((None, None), (3, 2.0)):
-        with pytest.raises(CohdcError, match="a budget is needed"):
-            _fit_options(None, [], epochs, minutes)
+    for epochs, minutes, given in ((None, None, "neither"), (3, 2.0, "both")):
+        options = NetworkBenchOptions(epochs=epochs, train_minutes=minutes)
+        with pytest.raises(CohdcError, match=f"give --epochs or --train-minutes, not {given}"):
+            options.fit_arguments()
+    with pytest.raises(CohdcError, match="threads is 0 and images is 20; both are at least 1"):
+        NetworkBenchOptions(threads=0)
+
+
+def test_failed_memory_probe_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(CohdcError, match=r"no\.onnx: does not run by itself: .*no such file"):
+        peak_memory(tmp_path / "no.onnx", np.zeros((8, 8, 3), np.uint8), 1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def _renamed(folder, name):
@@ -156,7 +164,7 @@ def _renamed(folder, name):
 def test_bench_keeps_a_table_it_did_not_write(tmp_path):
     (tmp_path / "table4.csv").write_text("mine")
     with pytest.raises(CohdcError, match=r"holds table4\.csv, not written by a former cohdc bench"):
-        bench(tmp_path, out=tmp_path, rows=[], models=[tmp_path / "absent.onnx"], epochs=1)
+        bench_networks(tmp_path, out=tmp_path, rows=[], models=[tmp_path / "absent.onnx"], epochs=1)
     assert (tmp_path / "table4.csv").read_text() == "mine"
 
 
@@ -164,9 +172,9 @@ def test_unknown_rows_and_files_are_one_line(tmp_path):
     with pytest.raises(
         CohdcError, match="no row 'VGG'; there are HDC-Net, ResNet50, ResNet101, MobileNetV1"
     ):
-        bench(tmp_path, out=tmp_path / "o", rows=["VGG"], epochs=1)
+        bench_networks(tmp_path, out=tmp_path / "o", rows=["VGG"], epochs=1)
     with pytest.raises(CohdcError, match="two have the same name"):
-        bench(
+        bench_networks(
             tmp_path,
             out=tmp_path / "o",
             rows=["ResNet50", _renamed(tmp_path, "ResNet50.yaml")],
@@ -175,7 +183,7 @@ def test_unknown_rows_and_files_are_one_line(tmp_path):
     with pytest.raises(
         CohdcError, match="weights are given for 'MobileNetV1', which is none of the rows"
     ):
-        bench(
+        bench_networks(
             tmp_path,
             out=tmp_path / "o",
             rows=["ResNet50"],
@@ -183,19 +191,23 @@ def test_unknown_rows_and_files_are_one_line(tmp_path):
             epochs=1,
         )
     with pytest.raises(CohdcError, match="no row 'VGG'"):
-        bench(tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"VGG": "x.pth"}, epochs=1)
+        bench_networks(
+            tmp_path, out=tmp_path / "o", rows=["ResNet50"], weights={"VGG": "x.pth"}, epochs=1
+        )
     with pytest.raises(CohdcError, match=r"absent\.onnx: no such file"):
-        bench(tmp_path, out=tmp_path / "o", rows=[], models=[tmp_path / "absent.onnx"], epochs=1)
+        bench_networks(
+            tmp_path, out=tmp_path / "o", rows=[], models=[tmp_path / "absent.onnx"], epochs=1
+        )
 
 
-def test_a_training_is_done_once_and_again_when_its_options_change(tmp_path, monkeypatch):
+def test_training_repeats_only_when_its_options_change(tmp_path, monkeypatch):
     calls = []
 
     def fake(log, verb, *arguments, threads):
         calls.append(arguments)
         (tmp_path / "last.ckpt").write_bytes(b"weights")
 
-    monkeypatch.setattr("cohdc_train.bench.training.call", fake)
+    monkeypatch.setattr("cohdc_train.bench.training.run_command", fake)
     first = train(tmp_path, [Path("d")], ["--a=1"])
     assert train(tmp_path, [Path("d")], ["--a=1"]) == first
     assert len(calls) == 1
@@ -207,31 +219,30 @@ def test_a_training_is_done_once_and_again_when_its_options_change(tmp_path, mon
 
 
 @pytest.mark.slow
-def test_a_failed_step_names_its_log(tmp_path):
+def test_failed_step_names_its_log(tmp_path):
     with pytest.raises(CohdcError, match=r"log\.txt: cohdc fit failed with"):
-        call(tmp_path / "log.txt", "fit", "--no.such.option=1")
+        run_command(tmp_path / "log.txt", "fit", "--no.such.option=1")
     assert "no.such.option" in (tmp_path / "log.txt").read_text()
 
 
-def test_an_interrupted_bench_goes_on_from_what_is_exported_and_scored(tmp_path, monkeypatch):
-    """Scores are kept with what they were made from: another file is scored anew."""
+def test_scores_are_reused_until_the_file_changes(tmp_path, monkeypatch):
     file = tmp_path / "model.onnx"
     file.write_bytes(b"one")
     runs = []
 
     class Scored:
         rows = ()
-        scores = dict.fromkeys(entries_module.SCORES.values(), 0.25)
+        scores = dict.fromkeys(rows_module.SCORES.values(), 0.25)
 
-    monkeypatch.setattr(entries_module, "score_file", lambda *a, **k: runs.append(a) or Scored)
-    kept = tmp_path / "scores.json"
-    first = entries_module._scores({"fps_ort": file}, tmp_path, kept, 1)
+    monkeypatch.setattr(rows_module, "score_file", lambda *a, **k: runs.append(a) or Scored)
+    cache_file = tmp_path / "scores.json"
+    first = rows_module._score_once({"fps_ort": file}, tmp_path, cache_file, 1)
     assert first["ap"] == 0.25
     assert np.isnan(first["vertices"])
-    entries_module._scores({"fps_ort": file}, tmp_path, kept, 1)
+    rows_module._score_once({"fps_ort": file}, tmp_path, cache_file, 1)
     assert len(runs) == 1
     file.write_bytes(b"two")
-    entries_module._scores({"fps_ort": file}, tmp_path, kept, 1)
+    rows_module._score_once({"fps_ort": file}, tmp_path, cache_file, 1)
     assert len(runs) == 2
 
 
@@ -243,9 +254,7 @@ def network_of(row):
 
 
 def test_rows_differ_as_their_names_say():
-    """Table 4's networks by tensors and rates: HDC-Net is dilated and has to be a tenth smaller
-    than ResNet50.
-    """
+    """Compare Table 4's networks by tensors and rates; HDC-Net is a tenth smaller than ResNet50."""
     networks = {row: network_of(row) for row in (*ROWS, "networks/resnet50_hdc.yaml")}
     body, whole = (
         {
@@ -263,7 +272,7 @@ def test_rows_differ_as_their_names_say():
 
 
 def test_the_family_shrinks_from_m_to_n():
-    """s has nano's layers; it is made for more pixels and holds more objects."""
+    """Compare sizes: s has the layers of n, more pixels and more objects."""
     m, s, n = (network_of(f"networks/hdc_net_{size}.yaml") for size in "msn")
     sizes = [sum(p.numel() for p in network.parameters()) for network in (m, s, n)]
     assert sizes[0] > sizes[1] == sizes[2]
@@ -272,14 +281,14 @@ def test_the_family_shrinks_from_m_to_n():
     assert s.config.detections > n.config.detections
 
 
-def test_a_training_is_done_again_when_its_configuration_changes(tmp_path, monkeypatch):
+def test_training_repeats_when_its_configuration_changes(tmp_path, monkeypatch):
     calls = []
 
     def fake(log, verb, *arguments, threads):
         calls.append(arguments)
         (tmp_path / "last.ckpt").write_bytes(b"weights")
 
-    monkeypatch.setattr("cohdc_train.bench.training.call", fake)
+    monkeypatch.setattr("cohdc_train.bench.training.run_command", fake)
     config = tmp_path / "c.yaml"
     for text in ("a: 1", "a: 1", "a: 2"):
         config.write_text(text)
@@ -289,16 +298,16 @@ def test_a_training_is_done_again_when_its_configuration_changes(tmp_path, monke
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
+def test_tiny_bench_from_data_to_table(tmp_path, capsys):
     data = coco_toys.folder(tmp_path / "data")
     (tmp_path / "tiny.yaml").write_text(TINY)
-    asked = {
+    options = {
         "rows": ["networks/resnet50.yaml", "MobileNetV1"],
         "fit_config": tmp_path / "tiny.yaml",
         "epochs": 1,
         "images": 2,
     }
-    table = bench(data, out=tmp_path / "out", **asked)
+    table = bench_networks(data, out=tmp_path / "out", **options)
     written = json.loads((tmp_path / "out" / "table4.json").read_text())
     assert [row["name"] for row in written] == ["resnet50", "MobileNetV1"]
     for row in written:
@@ -318,7 +327,7 @@ def test_a_tiny_bench_from_data_to_table(tmp_path, capsys):
     assert (tmp_path / "out" / "table4.png").read_bytes().startswith(b"\x89PNG")
     before = {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")}
     ours = tmp_path / "out" / "resnet50_seed0" / "model.onnx"
-    again = bench(data, out=tmp_path / "out", models=[ours], **asked)
+    again = bench_networks(data, out=tmp_path / "out", models=[ours], **options)
     assert {path: path.stat().st_mtime for path in (tmp_path / "out").rglob("*.onnx")} == before
     assert again[2]["ap"] == again[0]["ap"]
     assert again[2]["fps_torch"] is None

@@ -1,4 +1,4 @@
-"""Outlines: exact tracing with parts and holes, the floor of IoU, the search that moves vertices."""
+"""Outlines: exact tracing with parts and holes, the floor of the IoU, the vertex search."""
 
 import cv2
 import numpy as np
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from cohdc_train.contour import (
     METHODS,
     BeetleSearch,
-    Method,
+    ContourMethod,
     Polygon,
-    joined,
+    count_vertices,
+    join_polygons,
     rasterize,
     simplify,
     trace,
-    vertices,
 )
-from cohdc_train.contour.polygon_iou import Coverage, crossing
+from cohdc_train.contour.polygon_iou import IoUEvaluator, rings_cross
 
 SIZE = (96, 128)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -27,7 +27,7 @@ FLOORS = st.sampled_from([0.8, 0.9, 0.95, 0.99, 1.0])
 
 
 def blob(seed: int, size: tuple[int, int] = SIZE) -> NDArray[np.bool_]:
-    """Smoothed noise above its 70th percentile: several parts with holes and bays."""
+    """Return smoothed noise above its 70th percentile: several parts with holes and bays."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=size), (0, 0), 6)
     return np.asarray(noise > np.quantile(noise, 0.7))
 
@@ -73,8 +73,8 @@ def test_tracing_and_filling_gives_any_mask_back(seed: int, share: float) -> Non
 @settings(max_examples=30, deadline=None)
 def test_keyhole_rings_fill_like_polygons_with_holes(seed: int) -> None:
     polygons = trace(blob(seed))
-    joined = [Polygon(polygon.keyhole()) for polygon in polygons]
-    assert np.array_equal(rasterize(joined, SIZE), rasterize(polygons, SIZE))
+    join_polygons = [Polygon(polygon.keyhole()) for polygon in polygons]
+    assert np.array_equal(rasterize(join_polygons, SIZE), rasterize(polygons, SIZE))
 
 
 @pytest.mark.filterwarnings(
@@ -92,7 +92,7 @@ def test_coco_tools_fill_our_rings_alike() -> None:
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_filling_follows_pixel_centres(seed: int) -> None:
+def test_filling_follows_pixel_centers(seed: int) -> None:
     triangle = np.random.default_rng(seed).uniform(-5, 45, (3, 2))
     filled = rasterize([Polygon(triangle)], (40, 40))
     y, x = np.mgrid[:40, :40] + 0.5
@@ -105,17 +105,19 @@ def test_filling_follows_pixel_centres(seed: int) -> None:
 
 @given(SEEDS, FLOORS, st.sampled_from(WITH_FLOOR))
 @settings(max_examples=40, deadline=None)
-def test_floor_holds_and_vertices_fall(seed: int, floor: float, method: Method) -> None:
+def test_floor_holds_and_vertices_fall(seed: int, floor: float, method: ContourMethod) -> None:
     mask = blob(seed)
     polygons = trace(mask)
     simpler = simplify(polygons, floor, method, search=BeetleSearch(n=3))
     assert iou(rasterize(simpler, SIZE), mask) >= floor
-    assert vertices(simpler) <= vertices(polygons)
+    assert count_vertices(simpler) <= count_vertices(polygons)
 
 
 @given(SEEDS, st.integers(0, 20), st.integers(0, 20), st.sampled_from(METHODS))
 @settings(max_examples=25, deadline=None)
-def test_a_moved_mask_has_the_moved_polygon(seed: int, dx: int, dy: int, method: Method) -> None:
+def test_moved_mask_has_the_moved_polygon(
+    seed: int, dx: int, dy: int, method: ContourMethod
+) -> None:
     mask = blob(seed)
     moved = np.zeros((SIZE[0] + 20, SIZE[1] + 20), bool)
     moved[dy : dy + SIZE[0], dx : dx + SIZE[1]] = mask
@@ -130,12 +132,12 @@ def test_a_moved_mask_has_the_moved_polygon(seed: int, dx: int, dy: int, method:
             assert np.allclose(ring + np.array([dx, dy]), moved_ring, atol=1e-9)
 
 
-def test_beetles_need_fewer_vertices_than_bisection() -> None:
+def test_vertex_search_needs_fewer_vertices_than_bisection() -> None:
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     disc = (x - 60) ** 2 + (y - 48) ** 2 < 40**2
     polygons = trace(disc)
     bisected, searched = simplify(polygons, 0.97), simplify(polygons, 0.97, "bas_dp")
-    assert vertices(searched) < vertices(bisected) < vertices(polygons) / 4
+    assert count_vertices(searched) < count_vertices(bisected) < count_vertices(polygons) / 4
     assert iou(rasterize(searched, SIZE), disc) >= 0.97
 
 
@@ -147,17 +149,17 @@ def test_same_seed_same_polygon() -> None:
     assert all(np.array_equal(a.outer, b.outer) for a, b in zip(first, again, strict=True))
 
 
-def test_fixed_tolerance_knows_no_floor() -> None:
+def test_fixed_tolerance_ignores_iou_floor() -> None:
     polygons = trace(blob(5))
     coarse, fine = (
         simplify(polygons, 1.0, "dp", epsilon=6),
         simplify(polygons, 1.0, "dp", epsilon=1),
     )
-    assert vertices(coarse) < vertices(fine) < vertices(polygons)
+    assert count_vertices(coarse) < count_vertices(fine) < count_vertices(polygons)
 
 
 def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
-    """Every edge against every other, in plain Python: whether two cross in a point inside both."""
+    """Return whether two edges cross in a point inside both; compares all pairs."""
     edges = [
         (a, b)
         for ring in rings
@@ -176,10 +178,10 @@ def cross_somewhere(rings: list[NDArray[np.float64]]) -> bool:
 
 @given(SEEDS, FLOORS, st.sampled_from(WITH_FLOOR))
 @settings(max_examples=30, deadline=None)
-def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(
-    seed: int, floor: float, method: Method
+def test_rings_do_not_cross_and_keep_orientation(
+    seed: int, floor: float, method: ContourMethod
 ) -> None:
-    """Holes turn against their outer ring."""
+    """Holes have the opposite orientation of their outer ring."""
     simpler = simplify(trace(blob(seed)), floor, method, search=BeetleSearch(n=3))
     assert not cross_somewhere([ring for polygon in simpler for ring in polygon.rings])
 
@@ -194,46 +196,46 @@ def test_rings_cross_nowhere_and_turn_the_way_they_were_traced(
     assert all(turn(hole) == -turn(polygon.outer) for polygon in simpler for hole in polygon.holes)
 
 
-def test_crossing_tells_a_bow_tie_from_a_square_and_touching_from_crossing() -> None:
+def test_rings_cross_for_bow_tie_but_not_for_touching_squares() -> None:
     square = np.array([[0, 0], [4, 0], [4, 4], [0, 4]], float)
-    assert not crossing([square])
-    assert crossing([square[[0, 2, 1, 3]]])
-    assert crossing([square, square + 1])
-    assert not crossing([square, square + np.array([4, 0])])  # a side in common
+    assert not rings_cross([square])
+    assert rings_cross([square[[0, 2, 1, 3]]])
+    assert rings_cross([square, square + 1])
+    assert not rings_cross([square, square + np.array([4, 0])])  # a side in common
 
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_coverage_by_crossings_is_coverage_by_filling(seed: int) -> None:
-    """Of rings that cross themselves too."""
+def test_iou_by_crossings_equals_iou_by_filling(seed: int) -> None:
+    """It holds for rings that cross themselves, too."""
     mask = blob(seed)
-    coverage, rng = Coverage(polygons := trace(mask)), np.random.default_rng(seed)
-    low, high = coverage.low, coverage.high
+    evaluator, rng = IoUEvaluator(polygons := trace(mask)), np.random.default_rng(seed)
+    low, high = evaluator.low, evaluator.high
     tangled = [Polygon(rng.uniform(low, high, (7, 2))) for _ in range(2)]
     for coarser in (simplify(polygons, method="dp", epsilon=3), tangled):
-        assert coverage.iou(coarser) == iou(rasterize(coarser, SIZE), mask)
+        assert evaluator.iou(coarser) == iou(rasterize(coarser, SIZE), mask)
 
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_difference_of_edges_is_what_a_moved_vertex_changes(seed: int) -> None:
+def test_added_pixels_of_edges_equal_change_by_moved_vertex(seed: int) -> None:
     """The pixels that only one of outline and polygon has, counted by filling."""
     mask = blob(seed)
-    coverage, rng = Coverage(trace(mask)), np.random.default_rng(seed)
-    low, high = coverage.low, coverage.high
-    a, b = (coverage.nearest(low + (high - low) * share) for share in ([0, 0.5], [1, 0.5]))
-    heads = coverage.nearest(rng.uniform((low[0], (low[1] + high[1]) / 2), high, (5, 2)))
+    evaluator, rng = IoUEvaluator(trace(mask)), np.random.default_rng(seed)
+    low, high = evaluator.low, evaluator.high
+    a, b = (evaluator.snap_to_grid(low + (high - low) * share) for share in ([0, 0.5], [1, 0.5]))
+    heads = evaluator.snap_to_grid(rng.uniform((low[0], (low[1] + high[1]) / 2), high, (5, 2)))
     apart = [(rasterize([Polygon(np.array([a, b, head]))], SIZE) ^ mask).sum() for head in heads]
     turn = -1 if cv2.contourArea(trace(mask)[0].outer.astype(np.float32), oriented=True) < 0 else 1
     start, end = np.repeat(b[None], 5, 0), np.repeat(a[None], 5, 0)
     assert cv2.contourArea(np.array([a, b, high], np.float32), oriented=True) > 0
-    added = coverage.difference(start, heads) + coverage.difference(heads, end)
+    added = evaluator.count_added_pixels(start, heads) + evaluator.count_added_pixels(heads, end)
     assert np.array_equal(turn * (added - added[0]), np.subtract(apart, apart[0]))
 
 
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
-def test_a_turned_mask_has_the_turned_outline(seed: int) -> None:
+def test_turned_mask_has_the_turned_outline(seed: int) -> None:
     mask = blob(seed)
     turned = trace(np.rot90(mask))  # (x, y) goes to (y, width - x)
     points = {tuple(p) for polygon in trace(mask) for ring in polygon.rings for p in ring.tolist()}
@@ -246,7 +248,9 @@ def test_a_turned_mask_has_the_turned_outline(seed: int) -> None:
 @settings(max_examples=30, deadline=None)
 def test_one_ring_for_all_parts_fills_like_the_parts(seed: int) -> None:
     polygons = trace(blob(seed))
-    assert np.array_equal(rasterize([Polygon(joined(polygons))], SIZE), rasterize(polygons, SIZE))
+    assert np.array_equal(
+        rasterize([Polygon(join_polygons(polygons))], SIZE), rasterize(polygons, SIZE)
+    )
 
 
 def odd_masks() -> dict[str, NDArray[np.bool_]]:
@@ -266,57 +270,55 @@ def odd_masks() -> dict[str, NDArray[np.bool_]]:
 
 @pytest.mark.parametrize("name", odd_masks())
 @pytest.mark.parametrize("method", METHODS)
-def test_odd_masks_have_outlines_that_keep_the_floor(name: str, method: Method) -> None:
+def test_odd_masks_have_outlines_that_keep_the_floor(name: str, method: ContourMethod) -> None:
     mask = odd_masks()[name]
     polygons = trace(mask)
     simpler = simplify(polygons, 0.9, method, epsilon=0.25)
     assert iou(rasterize(simpler, mask.shape), mask) >= 0.9
-    assert vertices(simpler) <= vertices(polygons)
+    assert count_vertices(simpler) <= count_vertices(polygons)
     if name == "full frame":
-        assert vertices(simpler) == 4
+        assert count_vertices(simpler) == 4
 
 
-def test_a_huge_mask_is_traced_and_simplified() -> None:
-    """8000 x 8000 px; with a full frame's area it would take minutes if a step were quadratic in
-    pixels.
-    """
+def test_huge_mask_is_traced_and_simplified() -> None:
+    """A step that is quadratic in pixels would take minutes for 8000 x 8000 px."""
     mask = np.zeros((8000, 8000), bool)
     cv2.ellipse(view := mask.view(np.uint8), (4000, 4000), (3500, 2000), 30, 0, 360, 1, -1)
     simpler = simplify(trace(mask), 0.97, "bas_dp")
-    assert vertices(simpler) < 40
+    assert count_vertices(simpler) < 40
     filled = rasterize(simpler, mask.shape)
     assert np.count_nonzero(filled & mask) / np.count_nonzero(filled | mask) >= 0.97
     assert view.any()
 
 
-def test_a_ring_turned_inside_out_is_not_valid() -> None:
+def test_ring_of_wrong_orientation_is_not_valid() -> None:
     mask = np.zeros((4, 4), bool)
     mask[:, 0] = mask[3] = True
-    coverage = Coverage(trace(mask))
+    evaluator = IoUEvaluator(trace(mask))
     (outline,) = trace(mask)
-    assert coverage.valid([outline])
-    assert not coverage.valid([Polygon(outline.outer[::-1])])
+    assert evaluator.is_valid([outline])
+    assert not evaluator.is_valid([Polygon(outline.outer[::-1])])
 
 
-def test_a_hole_must_turn_against_its_outer_ring() -> None:
+def test_hole_must_have_opposite_orientation() -> None:
     mask = np.ones((6, 6), bool)
     mask[2:4, 1:5] = False
     (outline,) = trace(mask)
-    coverage = Coverage([outline])
-    assert coverage.valid([outline])
-    assert not coverage.valid([Polygon(outline.outer, (outline.holes[0][::-1],))])
+    evaluator = IoUEvaluator([outline])
+    assert evaluator.is_valid([outline])
+    assert not evaluator.is_valid([Polygon(outline.outer, (outline.holes[0][::-1],))])
 
 
 @given(SEEDS, st.sampled_from([0.5, 0.8]))
 @settings(max_examples=60, deadline=None)
-def test_the_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
-    """Where a vertex's move may turn a ring over."""
+def test_floor_holds_for_small_masks_too(seed: int, floor: float) -> None:
+    """The move of a vertex may turn a small ring inside out."""
     mask = blob(seed)[20:36, 30:46]
     if mask.any():
         assert iou(rasterize(simplify(trace(mask), floor, "bas_dp"), mask.shape), mask) >= floor
 
 
-def test_an_unknown_method_is_named() -> None:
+def test_unknown_method_is_named() -> None:
     with pytest.raises(
         ValueError, match="contour method 'rdp'; there are bisection, bas_dp, dp, visvalingam"
     ):
@@ -326,6 +328,6 @@ def test_an_unknown_method_is_named() -> None:
 def test_search_parameters_have_the_papers_names() -> None:
     search = BeetleSearch(S=1.0, H=0.5, c=1.0, n=3)
     polygons = trace(blob(6))
-    assert vertices(simplify(polygons, 0.9, "bas_dp", search=search)) <= vertices(
+    assert count_vertices(simplify(polygons, 0.9, "bas_dp", search=search)) <= count_vertices(
         simplify(polygons, 0.9)
     )

@@ -1,4 +1,4 @@
-"""Parts of the two searches: the bracket of tolerances, and the beetles."""
+"""Parts of the two searches: the bracket of tolerances, and the vertex swarm."""
 
 from math import exp, log
 
@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cohdc_train.contour import BeetleSearch, Polygon, rasterize, simplify, trace, vertices
-from cohdc_train.contour.beetle_search import _Beetles
-from cohdc_train.contour.polygon_iou import Coverage, crossing
-from cohdc_train.contour.tolerance_search import Bracket
+from cohdc_train.contour import BeetleSearch, Polygon, count_vertices, rasterize, simplify, trace
+from cohdc_train.contour.polygon_iou import IoUEvaluator, rings_cross
+from cohdc_train.contour.tolerance_search import ToleranceBracket
+from cohdc_train.contour.vertex_swarm import VertexSwarm
 
 SIZE = (96, 128)
 
 
 def two_discs(radius: float) -> NDArray[np.bool_]:
-    """One of 30 px, and one beside it."""
+    """Return a disc of 30 px and a second disc."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     big, small = (x - 40) ** 2 + (y - 48) ** 2 < 30**2, (x - 100) ** 2 + (y - 48) ** 2 < radius**2
     return np.asarray(big | small)
@@ -28,10 +28,11 @@ def two_discs(radius: float) -> NDArray[np.bool_]:
 def test_bracket_closes_on_the_tolerance_that_reaches_the_floor(
     right: float, power: float, wrong: float, allowed: float
 ) -> None:
-    """What is lost is a power of the tolerance; the first guess is off by `wrong`. Vertices never
-    end the search.
+    """The loss is a power of the tolerance, and the first guess is wrong by a factor.
+
+    The number of vertices never ends the search.
     """
-    bracket = Bracket.of(0.25, 40.0, allowed, wrong * allowed / right)
+    bracket = ToleranceBracket.of(0.25, 40.0, allowed, wrong * allowed / right)
     tried = 0
     while True:
         tried += 1
@@ -49,54 +50,48 @@ def test_bracket_closes_on_the_tolerance_that_reaches_the_floor(
 
 
 def test_bracket_ends_when_its_ends_differ_by_one_vertex() -> None:
-    bracket = Bracket.of(0.25, 40.0, 0.05, 0.05)
+    bracket = ToleranceBracket.of(0.25, 40.0, 0.05, 0.05)
     assert bracket.add(0.02, 12, True)
     assert not bracket.add(0.09, 11, False)
 
 
 @given(st.lists(st.integers(3, 9), min_size=1, max_size=4), st.integers(0, 20))
 @settings(max_examples=60, deadline=None)
-def test_beetles_of_a_turn_are_no_neighbours_and_every_beetle_gets_its_turn(
-    sizes: list[int], first: int
-) -> None:
+def test_vertices_that_move_together_are_no_neighbors(sizes: list[int], first: int) -> None:
     rings = []
     for k, size in enumerate(sizes):
         angle = np.arange(size) * 2 * np.pi / size
         rings.append(np.stack([10 + 20 * k + 8 * np.cos(angle), 10 + 8 * np.sin(angle)], axis=1))
     polygons = [Polygon(ring) for ring in rings]
-    beetles = _Beetles(polygons, Coverage(polygons), pairs=4)
+    swarm = VertexSwarm(polygons, IoUEvaluator(polygons), pairs=4)
     moved = set()
     for k in range(max(sizes)):
-        for index in beetles._turns(first + k):
-            assert not set(beetles._after[index].tolist()) & set(index.tolist())
+        for index in swarm._turns(first + k):
+            assert not set(swarm._after[index].tolist()) & set(index.tolist())
             moved |= set(index.tolist())
     assert moved == set(range(sum(sizes)))
 
 
 @given(st.floats(4, 25), st.integers(0, 1000))
 @settings(max_examples=30, deadline=None)
-def test_what_f_adds_up_to_is_the_pixels_that_only_one_of_the_two_has(
-    radius: float, seed: int
-) -> None:
-    """Through moves and drops, of one vertex, of several and of a whole part; counted by filling at
-    the end.
-    """
+def test_sum_of_f_counts_differing_pixels(radius: float, seed: int) -> None:
+    """It holds through moves and drops of one vertex, of several and of a whole part."""
     mask, rng = two_discs(radius), np.random.default_rng(seed)
     outline = trace(mask)
-    coverage = Coverage(outline)
-    beetles = _Beetles(simplify(outline, 0.97), coverage, pairs=4)
+    evaluator = IoUEvaluator(outline)
+    swarm = VertexSwarm(simplify(outline, 0.97), evaluator, pairs=4)
     for k, together in enumerate((3, 1, 2)):
-        beetles.move(2.0, (2.0, 1.0)[k % 2], k, rng)
-        choices = beetles.missed_together(together) if together > 1 else beetles.least_missed(1)
+        swarm.move(2.0, (2.0, 1.0)[k % 2], k, rng)
+        choices = swarm.joint_removals(together) if together > 1 else swarm.cheapest_removals(1)
         if choices:
-            beetles = beetles.without(*choices[0])
-    polygons = beetles.polygons()
-    if coverage.valid(polygons):
-        assert beetles._apart == (rasterize(polygons, SIZE) ^ mask).sum()
-        assert beetles.iou_about() == pytest.approx(beetles.iou(), abs=0.01)
+            swarm = swarm.without(*choices[0])
+    polygons = swarm.polygons()
+    if evaluator.is_valid(polygons):
+        assert swarm._apart == (rasterize(polygons, SIZE) ^ mask).sum()
+        assert swarm.approximate_iou() == pytest.approx(swarm.iou(), abs=0.01)
 
 
-def test_a_small_part_goes_as_a_whole_and_a_larger_one_stays() -> None:
+def test_small_part_is_dropped_and_large_part_stays() -> None:
     """Bisection keeps the small one, as it has more than two vertices."""
     small, large = trace(two_discs(4)), trace(two_discs(12))
     assert len(simplify(small, 0.95)) == 2
@@ -105,18 +100,18 @@ def test_a_small_part_goes_as_a_whole_and_a_larger_one_stays() -> None:
 
 
 def test_moves_after_the_last_drop_raise_the_iou() -> None:
-    """Above what the floor asks for, with the vertices that are left."""
+    """The IoU rises above the floor with the same vertices."""
     mask = two_discs(25)
     polygons = trace(mask)
     spare = [
-        Coverage(polygons).iou(simplify(polygons, floor, "bas_dp")) - floor
+        IoUEvaluator(polygons).iou(simplify(polygons, floor, "bas_dp")) - floor
         for floor in (0.93, 0.95, 0.97)
     ]
     assert min(spare) >= 0
     assert max(spare) > 0.005
 
 
-def test_without_moves_there_is_nothing_but_dropping() -> None:
+def test_search_without_moves_only_drops_vertices() -> None:
     polygons = trace(two_discs(25))
     simpler = simplify(polygons, 0.95, "bas_dp", search=BeetleSearch(n=0))
     corners = {tuple(p) for polygon in polygons for p in polygon.outer.tolist()}
@@ -129,12 +124,12 @@ def test_whiskers_of_any_length_keep_the_floor(c: float) -> None:
     simpler = simplify(trace(mask), 0.97, "bas_dp", search=BeetleSearch(c=c))
     filled = rasterize(simpler, SIZE)
     assert (filled & mask).sum() / (filled | mask).sum() >= 0.97
-    assert vertices(simpler) < vertices(simplify(trace(mask), 0.97))
+    assert count_vertices(simpler) < count_vertices(simplify(trace(mask), 0.97))
 
 
 def test_crossings_are_found_between_blocks_of_edges() -> None:
     angle = np.arange(3000) * 2 * np.pi / 3000
     circle = np.round(np.stack([np.cos(angle), np.sin(angle)], axis=1) * 5000) / 10
-    assert not crossing([circle])
-    assert not crossing([circle, circle * 0.9])
-    assert crossing([circle, circle + np.array([30.0, 17.3])])
+    assert not rings_cross([circle])
+    assert not rings_cross([circle, circle * 0.9])
+    assert rings_cross([circle, circle + np.array([30.0, 17.3])])

@@ -10,7 +10,7 @@ from cohdc_train.cli import main
 from cohdc_train.demo import Plan, demo
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import MANIFEST, files_below
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
@@ -56,17 +56,17 @@ def test_every_stage_left_its_files(finished):
         "report.html",
     ]
     assert [name for name in files if not (finished / name).is_file()] == []
-    assert len(read_tum(finished / "without" / "trajectory.txt").stamps) == 12
+    assert len(Trajectory.load_tum(finished / "without" / "trajectory.txt").timestamps) == 12
     coverage = json.loads((finished / "summary.json").read_text())["coverage"]
     assert coverage == 1.0
-    assert len(read_tum(finished / "with" / "trajectory.txt").stamps) == 12
+    assert len(Trajectory.load_tum(finished / "with" / "trajectory.txt").timestamps) == 12
 
 
 def test_the_report_needs_no_other_file(finished):
     page = (finished / "report.html").read_text()
     assert page.count("data:image/") >= 10
     assert 'src="http' not in page
-    assert "Absolute trajectory error" in page
+    assert "Translation error (ATE)" in page
 
 
 def test_a_folder_of_something_else_is_not_touched(tmp_path):

@@ -1,4 +1,4 @@
-"""A checkpoint becomes an ONNX file that equals it, or no file."""
+"""`cohdc export`: a checkpoint becomes an ONNX file that equals it, or no file."""
 
 import copy
 import dataclasses
@@ -16,11 +16,10 @@ import torch
 from cohdc_train import signature
 from cohdc_train.cli import main
 from cohdc_train.errors import CohdcError, ContractError, ExportError
-from cohdc_train.exporter import parity
-from cohdc_train.exporter import steps as command
+from cohdc_train.exporter import parity, steps
 from cohdc_train.exporter.export import export
 from cohdc_train.exporter.graph import count_flops
-from cohdc_train.exporter.sample_images import drawn_images
+from cohdc_train.exporter.sample_images import draw_samples
 from cohdc_train.models import Detector, MaskRCNN, detect
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.train.module import MaskRCNNModule
@@ -46,18 +45,18 @@ def exported(checkpoint):
 
 @pytest.fixture
 def written(exported, monkeypatch):
-    """The file that was exported once, in the place of what torch's exporter would write again."""
+    """Copy the file that was exported once where torch's exporter would write it again."""
 
     def write(network, class_names, path):
         shutil.copyfile(exported, path)
         return 0
 
-    monkeypatch.setattr(command, "write_graph", write)
+    monkeypatch.setattr(steps, "write_graph", write)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A COCO-format folder of the classes of the checkpoint."""
+    """Make a COCO-format folder with the classes of the checkpoint."""
     root = tmp_path_factory.mktemp("data")
     toys.folder(root)
     return root
@@ -82,9 +81,7 @@ def test_the_file_is_reported_equal_at_three_sizes_three_batches_without_detecti
 
 
 def test_gflops_of_a_detection_by_hand(exported, opinionated, small_config):
-    """Four 3x3 convolutions on 14x14 cells, a deconvolution to 28x28, and a 1x1 for background and
-    two classes.
-    """
+    """Count four 3x3 convolutions, a deconvolution, and a 1x1 for background and two classes."""
     without_cqe = count_flops(MaskRCNN(2, dataclasses.replace(small_config, cqe="off")).eval())
     c, cells = small_config.fpn_channels, 14 * 14
     flops = 2 * (4 * 9 * c * c * cells + 4 * c * c * cells + c * 3 * 4 * cells)
@@ -112,7 +109,7 @@ def test_metadata_and_shapes_keep_the_contract(exported):
 def test_the_segmenter_sees_what_the_network_sees_at_a_third_size(exported, opinionated):
     rng = np.random.default_rng(3)
     image = cv2.resize(rng.integers(0, 255, (10, 14, 3)).astype(np.uint8), (222, 111))
-    found = Segmenter(exported, threads=1)(image)
+    found = Segmenter(exported, num_threads=1)(image)
     expected = detect(opinionated, [torch.from_numpy(image).permute(2, 0, 1)])[0]
     assert len(found) == len(expected["scores"]) > 0
     np.testing.assert_allclose(found.boxes, expected["boxes"], atol=1e-2)
@@ -179,14 +176,14 @@ def test_a_pyramid_from_stride_8_on_a_light_backbone_exports(backbone, small_con
     config = dataclasses.replace(small_config, rates=((1,),) * 4, **changed)
     module = MaskRCNNModule(["person", "car"], config)
     with torch.no_grad():
-        pictures = [
+        images = [
             torch.from_numpy(cv2.resize(p, (128, 96))).permute(2, 0, 1) / 255
-            for p in drawn_images(4)
+            for p in draw_samples(4)
         ]
         for _ in range(
             30
-        ):  # without statistics of pictures, a deep random network is nearly constant
-            module.network.train().features(torch.stack(pictures))
+        ):  # without statistics of images, a deep random network is nearly constant
+            module.network.train().features(torch.stack(images))
         module.network.eval().rpn.head.bbox_pred.weight.mul_(10)
         module.network.rpn.head.cls_logits.weight.mul_(3)
     torch.save(
@@ -226,15 +223,13 @@ def test_export_replaces_its_own_file(checkpoint, written, tmp_path):
 
 
 def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, monkeypatch):
-    """Parity is real: with a tolerance below rounding the export fails, and nothing lies in the
-    folder.
-    """
+    """The export fails with a tolerance below rounding, and leaves no file."""
 
     monkeypatch.setitem(parity.TOLERANCES, "masks", 0.0)
     with pytest.raises(ExportError, match=r"m\.onnx: masks differ from torch by"):
         export(checkpoint, tmp_path / "m.onnx")
     monkeypatch.setitem(parity.TOLERANCES, "masks", 1e-3)
-    monkeypatch.setattr(parity, "LEAST_MASK_IOU", 1.01)
+    monkeypatch.setattr(parity, "MIN_MASK_IOU", 1.01)
     with pytest.raises(
         ExportError, match=r"m\.onnx: a mask's IoU with torch's is .* at least 1.01 wanted"
     ):
@@ -243,39 +238,37 @@ def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, m
 
 
 def test_wrong_masks_and_other_detections_are_seen(opinionated, exported):
-    """The comparison fails when the network that is compared is not the one in the file."""
-    pictures = drawn_images(2)
-    parity.compare(opinionated, exported, pictures).require(exported)
+    """The comparison fails for another network than the one in the file."""
+    images = draw_samples(2)
+    parity.compare(opinionated, exported, images).require(exported)
     other = copy.deepcopy(opinionated)
     other.roi_heads.mask_predictor.mask_fcn_logits.weight.data.mul_(1.1)
-    assert parity.compare(other, exported, pictures).max_difference["masks"] > 1e-3
+    assert parity.compare(other, exported, images).max_difference["masks"] > 1e-3
     other.roi_heads.box_predictor.cls_score.weight.data.mul_(3)
     with pytest.raises(ExportError, match="finds other objects than torch"):
-        parity.compare(other, exported, pictures).require(exported)
+        parity.compare(other, exported, images).require(exported)
 
 
-def test_pictures_that_hinge_on_rounding_decide_nothing_and_are_few(opinionated):
-    """A network whose threshold is the score of something it finds differs from itself, an ordinary
-    one does not.
-    """
-    (picture,) = drawn_images(1)
+def test_ambiguous_images_are_skipped_and_few(opinionated):
+    """A network whose threshold equals a detection's score is ambiguous; another is not."""
+    (image,) = draw_samples(1)
 
     def found_by(detector):
         with torch.inference_mode():
-            return [tensor.numpy()[0] for tensor in detector(torch.from_numpy(picture)[None])]
+            return [tensor.numpy()[0] for tensor in detector(torch.from_numpy(image)[None])]
 
     sure, edge = Detector(opinionated), Detector(copy.deepcopy(opinionated))
     found = found_by(sure)
-    assert not parity._hinges_on_rounding(sure, picture, found)
+    assert not parity._is_ambiguous(sure, image, found)
     at = float(found[2][int(found[-1]) - 1])
     edge.network.config = dataclasses.replace(opinionated.config, score_threshold=at)
-    assert parity._hinges_on_rounding(edge, picture, found_by(edge))
-    few = parity.Parity(images=7) | parity.Parity(images=1, undecided=1)
+    assert parity._is_ambiguous(edge, image, found_by(edge))
+    few = parity.Parity(images=7) | parity.Parity(images=1, ambiguous=1)
     few.require("m.onnx")
     with pytest.raises(
-        ExportError, match=r"m\.onnx: what torch finds hinges on rounding in 3 of 10 images"
+        ExportError, match=r"m\.onnx: torch's detections depend on rounding in 3 of 10 images"
     ):
-        (few | parity.Parity(images=2, undecided=2)).require("m.onnx")
+        (few | parity.Parity(images=2, ambiguous=2)).require("m.onnx")
 
 
 def test_verify_only_finds_the_checkpoint_and_sees_that_it_changed(
@@ -337,7 +330,7 @@ def test_int8_keeps_the_contract_and_says_what_it_scores(checkpoint, written, fo
     assert {int(np.abs(array.astype(int)).max()) for array in dense} == {
         64
     }  # 255 * 64 * 2 fits into 16 bits
-    assert Segmenter(tmp_path / "model.int8.onnx")(drawn_images(1)[0]).class_names == (
+    assert Segmenter(tmp_path / "model.int8.onnx")(draw_samples(1)[0]).class_names == (
         "person",
         "car",
     )
@@ -347,19 +340,18 @@ def test_int8_keeps_the_contract_and_says_what_it_scores(checkpoint, written, fo
 def test_int8_that_loses_too_much_is_refused(checkpoint, written, folder, tmp_path, monkeypatch):
     scores = {"model.onnx": 0.5, "model.int8.onnx": 0.48}
 
-    class Judge:
+    class FakeScorer:
         def __init__(self, *_):
             pass
 
-        def network(self):
-            return dict.fromkeys(command.SCORES, scores["model.onnx"])
+        def score_network(self):
+            return dict.fromkeys(steps.SCORES, scores["model.onnx"])
 
-        def file(self, path):
-            return dict.fromkeys(
-                command.SCORES, scores[path.name.lstrip(".").rsplit(".", 2)[0].removesuffix(".tmp")]
-            )
+        def score_file(self, path):
+            name = path.name.lstrip(".").rsplit(".", 2)[0].removesuffix(".tmp")
+            return dict.fromkeys(steps.SCORES, scores[name])
 
-    monkeypatch.setattr(command, "Scorer", Judge)
+    monkeypatch.setattr(steps, "ValidationScorer", FakeScorer)
     calibration = folder / "images"
     with pytest.raises(CohdcError, match=r"int8 needs --data"):
         export(checkpoint, tmp_path / "model.onnx", int8=calibration)
@@ -376,7 +368,7 @@ def test_a_file_that_scores_otherwise_is_refused(
     checkpoint, written, folder, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(
-        command.Scorer, "file", lambda self, path: dict.fromkeys(command.SCORES, 0.5)
+        steps.ValidationScorer, "score_file", lambda self, path: dict.fromkeys(steps.SCORES, 0.5)
     )
     with pytest.raises(ExportError, match=r"m\.onnx: mask AP differs from torch's by"):
         export(checkpoint, tmp_path / "m.onnx", data=folder)
@@ -400,7 +392,7 @@ def test_bad_checkpoints_and_folders_are_one_line(tmp_path, checkpoint, capsys):
     assert "no.ckpt" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     with pytest.raises(CohdcError, match=r"empty: 0 images"):
-        export(checkpoint, tmp_path / "m.onnx", tmp_path / "empty")
+        export(checkpoint, tmp_path / "m.onnx", images=tmp_path / "empty")
 
 
 def test_a_foreign_file_is_no_segmenter(tmp_path):
@@ -437,8 +429,9 @@ def test_a_broken_contract_is_named(exported, tmp_path, break_it, message):
 
 def test_the_segmenter_never_imports_torch(exported):
     code = (
-        "import sys, numpy as np; from pathlib import Path; from cohdc_train.segmenter import Segmenter;"
-        f"print(len(Segmenter(Path({str(exported)!r}))(np.zeros((60, 80, 3), np.uint8)).boxes) >= 0);"
+        "import sys, numpy as np; from cohdc_train.segmenter import Segmenter;"
+        f"found = Segmenter({str(exported)!r})(np.zeros((60, 80, 3), np.uint8));"
+        "print(len(found) >= 0);"
         "print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

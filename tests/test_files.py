@@ -1,4 +1,4 @@
-"""A file or a folder is written whole or not at all."""
+"""Files and folders are written whole or not at all."""
 
 import json
 from pathlib import Path
@@ -18,13 +18,13 @@ from cohdc_train.files import (
 )
 
 
-def test_content_arrives_and_nothing_else_is_left(tmp_path):
+def test_written_file_has_content_and_leaves_no_temporary(tmp_path):
     files.write_json(tmp_path / "a.json", {"ü": [1, 2.5]})
     assert json.loads((tmp_path / "a.json").read_text("utf-8")) == {"ü": [1, 2.5]}
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_the_old_file_survives_content_that_cannot_be_written(tmp_path):
+def test_old_file_survives_content_that_cannot_be_written(tmp_path):
     files.write_text(tmp_path / "a.json", "old")
     with pytest.raises(TypeError):
         files.write_json(tmp_path / "a.json", {"x": object()})
@@ -48,7 +48,7 @@ def test_folders_are_whole_or_absent(tmp_path: Path) -> None:
 
 
 def fill(folder: Path, **contents: str) -> Path:
-    """A folder with files; `sub__name` is one in a folder below it."""
+    """Make a folder with files; `sub__name` is one in a folder below it."""
     for name, content in contents.items():
         file = folder / name.replace("__", "/")
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +101,7 @@ def test_published_files_replace_those_of_a_former_run_alone(tmp_path: Path) -> 
     assert not (out / "gone").exists()
 
 
-def test_a_file_that_appears_during_a_run_is_kept(tmp_path: Path) -> None:
+def test_file_that_appears_during_a_run_is_kept(tmp_path: Path) -> None:
     out = fill(tmp_path / "out", a="mine", b__c="mine")
     assert publish(fill(tmp_path / "draft", a="1", b="1", d="1"), out, "verb") == ["a", "b"]
     assert contents(out) == {"a": "mine", "b/c": "mine", "d": "1"}
@@ -113,7 +113,7 @@ def test_a_file_that_appears_during_a_run_is_kept(tmp_path: Path) -> None:
     "content",
     ["{", "[]", '{"verb": 1}', '{"verb": [1]}', '{"verb": ["../mine"]}', '{"verb": ["/mine"]}'],
 )
-def test_a_list_that_is_none_or_leads_out_is_refused(tmp_path: Path, content: str) -> None:
+def test_invalid_manifest_is_refused(tmp_path: Path, content: str) -> None:
     out = fill(tmp_path / "out")
     out.mkdir()
     (out / MANIFEST).write_text(content)

@@ -1,4 +1,4 @@
-"""tools/experiments/golden.py: what it takes for equal, and what for different."""
+"""tools/experiments/golden.py: which results count as equal, and which as different."""
 
 import json
 from collections.abc import Callable
@@ -18,7 +18,7 @@ def compare() -> ModuleType:
 
 @pytest.fixture
 def folders(tmp_path: Path) -> Folders:
-    """Two runs that differ in times, in the version, and in nothing else."""
+    """Write two runs that differ in times and version only."""
     for name, seconds in (("base", 1.25), ("head", 9.75)):
         write_run(tmp_path / name, seconds)
     return tmp_path / "base", tmp_path / "head"
@@ -113,6 +113,13 @@ def test_options_get_the_names_that_the_checkout_knows() -> None:
     assert checkout.translate(command, old) == command
     renamed = ["--dense_cloud", "true", "--settings.features.max_keypoints", "800"]
     assert checkout.translate(command, new) == ["slam", *renamed, "--seed", "0"]
+    assert checkout.translate(["fit", "--pictures=false"], "--figures F") == [
+        *("fit", "--figures=false")
+    ]
+    newest = new.replace("--seed", "--settings.seed")
+    command = ["slam", "--sequence", "walk", *command[1:]]
+    translated = ["slam", "walk", *renamed, "--settings.seed", "0"]
+    assert checkout.translate(command, newest) == translated
 
 
 def test_a_class_is_found_where_the_checkout_has_it() -> None:

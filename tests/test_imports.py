@@ -1,4 +1,4 @@
-"""Who may import whom: the table of rooms, read from the sources' imports."""
+"""Import rules between rooms: the table, compared with the sources' imports."""
 
 import ast
 from collections.abc import Iterator
@@ -17,16 +17,18 @@ ALLOWED: dict[str, set[str]] = {
     "files": {"errors"},
     "images": set(),
     "signature": set(),
+    "types": set(),
     "masks": set(),
+    "drawing": set(),
     "presets": {"errors"},
     "env": {"errors"},
     "contour": set(),
     "trajectory": {"errors"},
-    "data": {"images", "presets", "errors"},
-    "synth": {"errors"},
+    "data": {"drawing", "images", "presets", "errors"},
+    "synth": {"contour", "data", "drawing", "slam", "trajectory", "errors"},
     "models": set(),
     "metrics": {"models", "masks"},
-    "train": {"data", "models", "metrics", "signature", "presets", "errors"},
+    "train": {"data", "models", "metrics", "drawing", "signature", "presets", "errors"},
     "validation": {"train", "metrics", "data", "segmenter", "presets", "errors"},
     "exporter": {
         *("validation", "train", "models", "segmenter"),
@@ -34,18 +36,17 @@ ALLOWED: dict[str, set[str]] = {
     },
     "bench": {
         *("validation", "train", "metrics", "data", "models", "exporter", "segmenter"),
-        *("contour", "presets", "errors"),
+        *("contour", "slam", "presets", "errors"),
     },
     "segmenter": {"signature", "masks", "presets", "errors"},
-    "prediction": {"segmenter", "contour", "images", "errors"},
-    "slam": {"segmenter", "trajectory", "presets", "errors"},
+    "prediction": {"segmenter", "contour", "drawing", "images", "errors"},
+    "slam": {"segmenter", "trajectory", "drawing", "presets", "errors"},
     "report": {"trajectory", "errors"},
     "cli": {"errors"},  # and any verb's module, by name inside the call
 }
 ALLOWED["demo"] = set(ALLOWED) - {"cli", "__main__"}
-# The program's name and version, and whole-file writing, which import only the errors: any room may
-# use them.
-FREE = {"__init__", "files"}
+# Any room may use the name and version, array types, and whole-file writing, which imports errors.
+FREE = {"__init__", "files", "types"}
 WITHOUT_TORCH = (
     "slam",
     "segmenter",
@@ -54,6 +55,9 @@ WITHOUT_TORCH = (
     "contour",
     "report",
     "env",
+    "types",
+    "drawing",
+    "images",
     "masks",
     "cli",
 )
@@ -69,17 +73,16 @@ TORCH = {
 
 
 def sources(package: Path) -> Iterator[tuple[str, str, Path]]:
-    """(room, dotted module inside the package, file) of every source."""
+    """List (room, dotted module inside the package, file) of every source."""
     for file in sorted(package.rglob("*.py")):
         parts = file.relative_to(package).with_suffix("").parts
         yield parts[0], ".".join(parts), file
 
 
 def imported(file: Path, package: Path) -> Iterator[tuple[int, str]]:
-    """(line, absolute dotted name) of every import in a file, wherever in it; relative ones are
-    resolved.
+    """List (line, absolute dotted name) of every import in a file.
 
-    `from a import b` gives a.b, since b may be a module.
+    Relative imports are resolved. `from a import b` gives a.b, since b may be a module.
     """
     here = (package.name, *file.relative_to(package).with_suffix("").parts)
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -92,8 +95,9 @@ def imported(file: Path, package: Path) -> Iterator[tuple[int, str]]:
 
 
 def edges(package: Path) -> dict[str, set[tuple[str, str]]]:
-    """Room -> {(room or foreign package it imports, place)}; foreign ones are written with a
-    leading `/`.
+    """Map each room to {(room or foreign package that it imports, place)}.
+
+    Foreign packages are written with a leading `/`.
     """
     rooms = {room for room, _, _ in sources(package)}
     graph: dict[str, set[tuple[str, str]]] = {room: set() for room in rooms}
@@ -115,7 +119,7 @@ def edges(package: Path) -> dict[str, set[tuple[str, str]]]:
 
 
 def faults(package: Path) -> list[str]:
-    """Every import that the table forbids, and every way on which a torch-free room reaches torch."""
+    """List the imports that the table forbids, and the ways of torch-free rooms to torch."""
     graph = edges(package)
     found = [f"{room} is not in the table of rooms" for room in graph if room not in ALLOWED]
     for room, targets in graph.items():
@@ -130,7 +134,7 @@ def faults(package: Path) -> list[str]:
 
 
 def ways_to_torch(graph: dict[str, set[tuple[str, str]]], start: str) -> list[str]:
-    """Chains of rooms from `start` to an import of torch or of what needs it."""
+    """List the chains of rooms from `start` to an import of torch or of what needs it."""
     ways, seen, queue = [], {start}, [(start, start)]
     while queue:
         room, way = queue.pop(0)
@@ -148,9 +152,7 @@ def test_rooms_import_only_what_the_table_allows() -> None:
 
 
 def test_table_holds_no_cycle() -> None:
-    """The table itself goes one way: rooms can be put in an order in which each imports earlier
-    ones only.
-    """
+    """Rooms can be put in an order in which each imports earlier ones only."""
     placed: set[str] = set()
     while free := {room for room in ALLOWED if room not in placed and ALLOWED[room] <= placed}:
         placed |= free
@@ -247,23 +249,25 @@ SLAM_ROOMS = [
     "io",
     "dynamics",
     "tracking",
+    "system",
     "visualization",
     "runtime",
     "runner",
     "run",
 ]
-# What a room leaves out of those before it.
+# Earlier rooms that a room does not import.
 SLAM_APART = {
     "frame": {"optimization", "mapping", "loop_closing"},
     "io": {"features", "optimization", "mapping", "loop_closing"},
     "dynamics": {"loop_closing"},
-    "tracking": {"io"},
-    "runtime": {"visualization"},
+    "tracking": {"io", "loop_closing"},
+    "visualization": {"loop_closing", "tracking", "system"},
+    "runtime": {"loop_closing", "tracking", "system", "visualization"},
 }
 
 
 def slam_faults(folder: Path) -> list[str]:
-    """Return every import between rooms of slam that goes against their order."""
+    """List the imports between rooms of slam that go against their order."""
     found = []
     for file in sorted(folder.rglob("*.py")):
         room = file.relative_to(folder).with_suffix("").parts[0]

@@ -1,6 +1,4 @@
-"""`cohdc predict` with a network that answers from the image's brightness: files, filters, drawing,
-readers.
-"""
+"""`cohdc predict` with a fake segmenter: files, filters, drawing, readers."""
 
 import json
 from pathlib import Path
@@ -13,9 +11,10 @@ from numpy.typing import NDArray
 from cohdc_train.contour import Polygon, rasterize
 from cohdc_train.errors import ContractError, DataError
 from cohdc_train.files import MANIFEST
-from cohdc_train.prediction.drawing import draw
-from cohdc_train.prediction.image_sources import Picture, read_pictures
-from cohdc_train.prediction.predict import predict, predict_pictures
+from cohdc_train.prediction.drawing import draw_detections
+from cohdc_train.prediction.image_sources import SourceImage, read_images
+from cohdc_train.prediction.options import PredictOptions
+from cohdc_train.prediction.predict import predict, predict_images
 from cohdc_train.segmenter import Detections
 
 BOXES = np.array(
@@ -24,9 +23,7 @@ BOXES = np.array(
 
 
 class Fake:
-    """Finds three objects in every image: an oval with a hole, an oval, and one whose mask is
-    empty.
-    """
+    """Segmenter that finds an oval with a hole, an oval, and an object with an empty mask."""
 
     class_names = ("person", "car")
 
@@ -41,19 +38,19 @@ class Fake:
         return Detections(BOXES, labels, scores, quality, masks, (height, width), self.class_names)
 
 
-def picture(name: str = "room") -> Picture:
+def make_image(name: str = "room") -> SourceImage:
     rgb = np.random.default_rng(1).integers(0, 80, (100, 120, 3), np.uint8)
-    return Picture(f"{name}.png", name, rgb)
+    return SourceImage(f"{name}.png", name, rgb)
 
 
 def test_coco_file_holds_what_was_found(tmp_path: Path) -> None:
-    pictures = [picture("a"), picture("b")]
-    result = predict_pictures(pictures, Fake(), tmp_path / "new" / "out")
+    images = [make_image("a"), make_image("b")]
+    result = predict_images(images, Fake(), tmp_path / "new" / "out")
     assert json.loads((tmp_path / "new" / "out" / "predictions.json").read_text()) == result
     assert [image["file_name"] for image in result["images"]] == ["a.png", "b.png"]
     assert result["categories"] == [{"id": 1, "name": "person"}, {"id": 2, "name": "car"}]
     first, second, *_ = result["annotations"]
-    assert len(result["annotations"]) == 4, "the object without pixels is left out"
+    assert len(result["annotations"]) == 4, "the object without pixels is skipped"
     assert (first["category_id"], first["category"], second["category_id"]) == (1, "person", 2)
     assert first["bbox"] == [20, 10, 40, 80]
     assert second["score"] == pytest.approx(0.6)
@@ -67,8 +64,8 @@ def test_coco_file_holds_what_was_found(tmp_path: Path) -> None:
 
 
 def test_polygons_keep_the_floor(tmp_path: Path) -> None:
-    one = picture()
-    result = predict_pictures([one], Fake(), tmp_path, iou_floor=0.9)
+    one = make_image()
+    result = predict_images([one], Fake(), tmp_path, PredictOptions(iou_floor=0.9))
     for annotation, mask in zip(result["annotations"], Fake()(one.rgb).masks()[:2], strict=True):
         rings = [Polygon(np.reshape(ring, (-1, 2))) for ring in annotation["segmentation"]]
         filled = rasterize(rings, (100, 120))
@@ -81,8 +78,8 @@ def test_polygons_keep_the_floor(tmp_path: Path) -> None:
 )  # pycocotools under numpy 2
 def test_pycocotools_loads_the_file(tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools comes with the train extra")
-    one = picture()
-    predict_pictures([one], Fake(), tmp_path, iou_floor=1.0, contour="bisection")
+    one = make_image()
+    predict_images([one], Fake(), tmp_path, PredictOptions(iou_floor=1.0, contour="bisection"))
     loaded = coco.COCO(str(tmp_path / "predictions.json"))
     masks = [
         loaded.annToMask(annotation).astype(bool)
@@ -98,37 +95,37 @@ def test_pycocotools_loads_the_file(tmp_path: Path) -> None:
 def test_score_and_quality_filter(
     tmp_path: Path, least: tuple[float, float | None], left: list[float]
 ) -> None:
-    result = predict_pictures([picture()], Fake(), tmp_path, least)
+    result = predict_images([make_image()], Fake(), tmp_path, PredictOptions(*least))
     assert [annotation["score"] for annotation in result["annotations"]] == pytest.approx(left)
     assert (tmp_path / "room_overlay.jpg").is_file()
 
 
-def test_drawing_colours_the_masks_only(tmp_path: Path) -> None:
-    one = picture()
+def test_drawing_colors_the_masks_only(tmp_path: Path) -> None:
+    one = make_image()
     found = Fake()(one.rgb).select(np.array([False, True, False]))
-    drawn = draw(one.rgb, found, [[]])
+    drawn = draw_detections(one.rgb, found, [[]])
     mask = found.masks()[0]
     untouched = ~mask
     untouched[: int(BOXES[1, 1]) + 2, 60:] = False  # the text
     assert np.array_equal(drawn[untouched], one.rgb[untouched])
-    assert (drawn[mask][:, 0] > one.rgb[mask][:, 0] + 30).mean() > 0.9, "the first colour is red"
+    assert (drawn[mask][:, 0] > one.rgb[mask][:, 0] + 30).mean() > 0.9, "the first color is red"
 
 
 def test_folder_is_read_in_order_and_overlays_do_not_collide(tmp_path: Path) -> None:
-    for name, grey in [("b.png", 1), ("a.jpg", 2), ("a.png", 3)]:
-        cv2.imwrite(str(tmp_path / name), np.full((8, 8, 3), grey, np.uint8))
+    for name, gray in [("b.png", 1), ("a.jpg", 2), ("a.png", 3)]:
+        cv2.imwrite(str(tmp_path / name), np.full((8, 8, 3), gray, np.uint8))
     (tmp_path / "notes.txt").write_text("no image")
-    pictures = list(read_pictures(tmp_path))
-    assert [one.name for one in pictures] == ["a.jpg", "a.png", "b.png"]
-    assert [one.stem for one in pictures] == ["a.jpg", "a.png", "b"]
+    images = list(read_images(tmp_path))
+    assert [one.name for one in images] == ["a.jpg", "a.png", "b.png"]
+    assert [one.stem for one in images] == ["a.jpg", "a.png", "b"]
     cv2.imwrite(str(tmp_path / "a.jpg.png"), np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "folder.jpg").mkdir()
-    assert len({one.stem for one in read_pictures(tmp_path)}) == 4
+    assert len({one.stem for one in read_images(tmp_path)}) == 4
 
 
 def test_images_come_as_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "red.png"), np.full((4, 4, 3), (0, 0, 255), np.uint8))
-    (red,) = read_pictures(tmp_path / "red.png")
+    (red,) = read_images(tmp_path / "red.png")
     assert red.rgb[0, 0].tolist() == [255, 0, 0]
 
 
@@ -137,10 +134,10 @@ def test_video_frames_are_read(tmp_path: Path) -> None:
     writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
     if not writer.isOpened():
         pytest.skip("this OpenCV cannot write videos")
-    for grey in (10, 120, 230):
-        writer.write(np.full((48, 64, 3), grey, np.uint8))
+    for gray in (10, 120, 230):
+        writer.write(np.full((48, 64, 3), gray, np.uint8))
     writer.release()
-    frames = list(read_pictures(file))
+    frames = list(read_images(file))
     assert [frame.name for frame in frames] == [
         "walk_000000.jpg",
         "walk_000001.jpg",
@@ -150,7 +147,7 @@ def test_video_frames_are_read(tmp_path: Path) -> None:
 
 
 class _Webcam:
-    """In the place of OpenCV's: number 0 gives grey pictures without end, others none."""
+    """Fake of OpenCV's: number 0 gives gray images without end, others none."""
 
     released = 0
 
@@ -169,32 +166,32 @@ def test_a_webcam_is_a_number_and_has_an_end(
 ) -> None:
     monkeypatch.setattr(cv2, "VideoCapture", _Webcam)
     monkeypatch.chdir(tmp_path)
-    assert [picture.name for picture in read_pictures(Path("0"), 2)] == [
+    assert [image.name for image in read_images(Path("0"), 2)] == [
         "webcam0_000000.jpg",
         "webcam0_000001.jpg",
     ]
-    assert len(list(read_pictures(Path("0")))) == 100
-    with pytest.raises(DataError, match=r"webcam7: no picture comes out of it"):
-        list(read_pictures(Path("7")))
+    assert len(list(read_images(Path("0")))) == 100
+    with pytest.raises(DataError, match=r"webcam7: no image can be read from it"):
+        list(read_images(Path("7")))
     with pytest.raises(DataError, match="no such file"):
-        read_pictures(tmp_path / "12")
+        read_images(tmp_path / "12")
     with pytest.raises(DataError, match="frames is 0"):
-        read_pictures(Path("0"), 0)
+        read_images(Path("0"), 0)
     assert _Webcam.released == 3
     Path("0").mkdir()
     with pytest.raises(DataError, match="holds no image"):  # a folder of that name is that folder
-        read_pictures(Path("0"))
+        read_images(Path("0"))
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"absent: no such file"):
-        read_pictures(tmp_path / "absent")
+        read_images(tmp_path / "absent")
     with pytest.raises(DataError, match=r"holds no image"):
-        read_pictures(tmp_path)
+        read_images(tmp_path)
     for name, content in [("broken.jpg", b"not a jpeg"), ("empty.png", b"")]:
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=rf"{name}: cannot be decoded"):
-            list(read_pictures(tmp_path / name))
+            list(read_images(tmp_path / name))
 
 
 def test_verb_names_a_missing_model(tmp_path: Path) -> None:

@@ -1,6 +1,4 @@
-"""The files `cohdc predict` writes, read back by the converters: the same objects, their masks
-above the floor.
-"""
+"""`cohdc predict`: its files, read back by the converters, hold the same objects."""
 
 import json
 from collections.abc import Iterable
@@ -12,30 +10,31 @@ import numpy as np
 import pytest
 import yaml
 from conversion import converted, iou, masks_of
-from test_predict import Fake, picture
+from test_predict import Fake, make_image
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import files_below
-from cohdc_train.prediction.image_sources import Picture, read_pictures
-from cohdc_train.prediction.predict import predict, predict_pictures
+from cohdc_train.prediction.image_sources import SourceImage, read_images
+from cohdc_train.prediction.options import PredictOptions
+from cohdc_train.prediction.predict import predict, predict_images
 
 FLOOR = 0.93
 
 
-def photographs(folder: Path) -> list[Picture]:
-    """Four of them, on disk."""
+def photographs(folder: Path) -> list[SourceImage]:
+    """Write four images, and read them as a source."""
     folder.mkdir()
     for name in "abcd":
-        cv2.imwrite(str(folder / f"{name}.png"), picture().rgb)
-    return list(read_pictures(folder))
+        cv2.imwrite(str(folder / f"{name}.png"), make_image().rgb)
+    return list(read_images(folder))
 
 
-def written(folder: Path, pictures: Iterable[Picture], **options: Any) -> dict[str, Any]:
-    return predict_pictures(pictures, Fake(), folder, iou_floor=FLOOR, **options)
+def written(folder: Path, images: Iterable[SourceImage], **options: Any) -> dict[str, Any]:
+    return predict_images(images, Fake(), folder, PredictOptions(iou_floor=FLOOR, **options))
 
 
 def holds_what_was_found(found: list[tuple[str, Any]]) -> None:
-    masks = Fake()(picture().rgb).masks()
+    masks = Fake()(make_image().rgb).masks()
     assert sorted(name for name, _ in found) == ["car", "person"]
     for name, mask in found:
         assert (
@@ -44,8 +43,8 @@ def holds_what_was_found(found: list[tuple[str, Any]]) -> None:
 
 
 def test_labelme_files_come_back_as_the_same_objects(tmp_path: Path) -> None:
-    pictures = photographs(tmp_path / "photos")
-    written(tmp_path / "out", pictures, format="labelme")
+    images = photographs(tmp_path / "photos")
+    written(tmp_path / "out", images, format="labelme")
     assert len(list((tmp_path / "out" / "overlays").iterdir())) == 4
     splits = converted("labelme", tmp_path / "out")
     for name in "abcd":
@@ -92,18 +91,18 @@ def test_labelme_shapes_are_what_labelme_writes_and_the_doubtful_come_first(tmp_
 
 
 def test_a_frame_without_a_file_is_written_beside_its_labelme_file(tmp_path: Path) -> None:
-    written(tmp_path, [picture("walk_000000")], format="labelme", check_below=0.0)
+    written(tmp_path, [make_image("walk_000000")], format="labelme", check_below=0.0)
     content = json.loads((tmp_path / "walk_000000.json").read_text())
     assert cv2.imread(str(tmp_path / content["imagePath"])).shape == (100, 120, 3)
     assert (tmp_path / "review.txt").read_text() == "no contour to check\n"
 
 
 def test_corrected_labelme_files_are_not_written_over(tmp_path: Path) -> None:
-    pictures = photographs(tmp_path / "photos")
-    written(tmp_path / "out", pictures, format="labelme")
+    images = photographs(tmp_path / "photos")
+    written(tmp_path / "out", images, format="labelme")
     (tmp_path / "out" / "b.json").write_text("corrected")
-    with pytest.raises(DataError, match=r"a\.json: is there already, perhaps corrected by hand"):
-        written(tmp_path / "out", pictures, format="labelme")
+    with pytest.raises(DataError, match=r"a\.json: exists, perhaps corrected by hand"):
+        written(tmp_path / "out", images, format="labelme")
     assert (tmp_path / "out" / "b.json").read_text() == "corrected"
 
 
@@ -111,15 +110,15 @@ def test_what_was_found_before_a_broken_image_is_kept(tmp_path: Path) -> None:
     photographs(tmp_path / "photos")
     (tmp_path / "photos" / "z.png").write_bytes(b"broken")
     with pytest.raises(DataError, match=r"z\.png: cannot be decoded"):
-        written(tmp_path / "out", read_pictures(tmp_path / "photos"))
+        written(tmp_path / "out", read_images(tmp_path / "photos"))
     assert len(json.loads((tmp_path / "out" / "predictions.json").read_text())["images"]) == 4
 
 
-def test_yolo_refuses_two_pictures_of_one_stem(tmp_path: Path) -> None:
+def test_yolo_refuses_two_images_of_one_stem(tmp_path: Path) -> None:
     photographs(tmp_path / "photos")
-    cv2.imwrite(str(tmp_path / "photos" / "a.jpg"), picture().rgb)
+    cv2.imwrite(str(tmp_path / "photos" / "a.jpg"), make_image().rgb)
     with pytest.raises(DataError, match=r"a\.jpg: another image has this stem"):
-        written(tmp_path / "out", read_pictures(tmp_path / "photos"), format="yolo")
+        written(tmp_path / "out", read_images(tmp_path / "photos"), format="yolo")
 
 
 @pytest.mark.parametrize("option", ["iou_floor", "score", "check_below", "quality"])
@@ -129,11 +128,11 @@ def test_shares_beyond_one_are_refused(tmp_path: Path, option: str) -> None:
 
 
 def test_yolo_labels_come_back_as_the_same_objects(tmp_path: Path) -> None:
-    pictures = photographs(tmp_path / "photos")
-    written(tmp_path / "out", pictures, format="yolo")
+    images = photographs(tmp_path / "photos")
+    written(tmp_path / "out", images, format="yolo")
     root = tmp_path / "set"
     (root / "images").mkdir(parents=True)
-    for one in pictures:
+    for one in images:
         cv2.imwrite(str(root / "images" / one.name), one.rgb)
     (tmp_path / "out" / "labels").rename(root / "labels")
     names = yaml.safe_load((tmp_path / "out" / "data.yaml").read_text())
@@ -156,9 +155,8 @@ def test_fewer_vertices_make_smaller_files(tmp_path: Path, format: Any) -> None:
     sizes = {}
     for floor in (0.9, 1.0):
         folder = tmp_path / str(floor)
-        predict_pictures(
-            [picture()], Fake(), folder, iou_floor=floor, format=format, contour="bas_dp"
-        )
+        options = PredictOptions(iou_floor=floor, format=format, contour="bas_dp")
+        predict_images([make_image()], Fake(), folder, options)
         files = [
             file
             for file in folder.rglob("*")
@@ -189,18 +187,18 @@ def test_prediction_keeps_files_it_did_not_write(tmp_path: Path, format: Any, na
 
 
 def test_second_prediction_replaces_its_files_and_keeps_labels_added_since(tmp_path: Path) -> None:
-    pictures = photographs(tmp_path / "photos")
+    images = photographs(tmp_path / "photos")
     for format in ("coco", "yolo"):
         out = tmp_path / format
-        written(out, pictures[:1], format=format)
-        written(out, pictures[:2], format=format)
+        written(out, images[:1], format=format)
+        written(out, images[:2], format=format)
     (out / "labels" / "c.txt").write_text("mine")
     with pytest.raises(DataError, match=r"c\.txt: is there already, by somebody else"):
-        written(out, pictures, format="yolo")
+        written(out, images, format="yolo")
     assert (out / "labels" / "c.txt").read_text() == "mine"
 
 
 def test_yolo_labels_go_beside_images_that_are_there(tmp_path: Path) -> None:
-    pictures = photographs(tmp_path / "images")
-    written(tmp_path, pictures, format="yolo")
+    images = photographs(tmp_path / "images")
+    written(tmp_path, images, format="yolo")
     assert len(files_below(tmp_path / "labels")) == 4

@@ -1,4 +1,4 @@
-"""Shipped configs are found by name from any folder."""
+"""Shipped configurations are found by name from any folder."""
 
 import pytest
 

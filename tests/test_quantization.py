@@ -1,6 +1,4 @@
-"""Static quantisation of a MobileNet block behind a stem: what is rounded how, and that nothing
-saturates.
-"""
+"""Static quantization of a MobileNet block after a stem: rounding, and no saturation."""
 
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,7 @@ CHANNELS = 8
 
 
 def block(path: Path, stem: bool = True) -> None:
-    """uint8 pictures -> float -> a stem that changes nothing -> 3x3 convolution, ReLU6, depthwise
-    convolution, ReLU6, 1x1 convolution.
+    """Write a model: a stem that changes nothing, then a MobileNet block with ReLU6.
 
     stem: whether its second convolution is depthwise; else it is one ordinary convolution.
     """
@@ -38,18 +35,18 @@ def block(path: Path, stem: bool = True) -> None:
         "each": np.ones((3, 1, 1, 1), np.float32),
     }
     light = [
-        helper.make_node("Conv", ["picture", "same"], ["p"], "stem1", group=1),
+        helper.make_node("Conv", ["image", "same"], ["p"], "stem1", group=1),
         helper.make_node("Conv", ["p", "each"], ["q"], "stem2", group=3),
         helper.make_node("Conv", ["q", "same"], ["x"], "stem3", group=1),
     ]
     heavy = [
-        helper.make_node("Conv", ["picture", "same"], ["p"], "stem1", group=1),
+        helper.make_node("Conv", ["image", "same"], ["p"], "stem1", group=1),
         helper.make_node("Conv", ["p", "same"], ["x"], "stem2", group=1),
     ]
     nodes = [
         helper.make_node("Cast", [signature.INPUT], ["float"], "cast", to=onnx.TensorProto.FLOAT),
         helper.make_node("Transpose", ["float"], ["planes"], "transpose", perm=[0, 3, 1, 2]),
-        helper.make_node("Mul", ["planes", "scale"], ["picture"], "mul"),
+        helper.make_node("Mul", ["planes", "scale"], ["image"], "mul"),
         *(light if stem else heavy),
         helper.make_node("Conv", ["x", "dense"], ["a"], "first", group=1, pads=[1, 1, 1, 1]),
         helper.make_node("Clip", ["a", "zero", "six"], ["b"], "relu6"),
@@ -59,12 +56,10 @@ def block(path: Path, stem: bool = True) -> None:
         helper.make_node("Clip", ["c", "zero", "six"], ["d"], "another"),
         helper.make_node("Conv", ["d", "pointwise"], ["y"], "third", group=1),
     ]
-    picture = helper.make_tensor_value_info(
-        signature.INPUT, onnx.TensorProto.UINT8, [1, "h", "w", 3]
-    )
+    image = helper.make_tensor_value_info(signature.INPUT, onnx.TensorProto.UINT8, [1, "h", "w", 3])
     result = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, None)
     tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in numbers.items()]
-    graph = helper.make_graph(nodes, "block", [picture], [result], tensors)
+    graph = helper.make_graph(nodes, "block", [image], [result], tensors)
     onnx.save(
         helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path
     )
@@ -72,12 +67,12 @@ def block(path: Path, stem: bool = True) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[NDArray[np.uint8]]]:
-    """The block's file, its int8 form, and the pictures it was calibrated with: bright ones."""
+    """Make the block's file, its int8 form, and the bright images it was calibrated with."""
     folder, rng = tmp_path_factory.mktemp("block"), np.random.default_rng(1)
-    pictures = [rng.integers(128, 256, (32, 40, 3), dtype=np.uint8) for _ in range(8)]
+    images = [rng.integers(128, 256, (32, 40, 3), dtype=np.uint8) for _ in range(8)]
     block(folder / "block.onnx")
-    assert quantize(folder / "block.onnx", folder / "int8.onnx", pictures) == 5
-    return folder / "block.onnx", folder / "int8.onnx", pictures
+    assert quantize(folder / "block.onnx", folder / "int8.onnx", images) == 5
+    return folder / "block.onnx", folder / "int8.onnx", images
 
 
 def test_matrices_get_seven_bits_and_depthwise_weights_eight(made: tuple[Path, Path, Any]) -> None:
@@ -92,7 +87,7 @@ def test_matrices_get_seven_bits_and_depthwise_weights_eight(made: tuple[Path, P
 
 
 def test_relu6_is_left_to_the_rounding_behind_it(made: tuple[Path, Path, Any]) -> None:
-    """Otherwise every map is rounded twice, and turned into float32 in between."""
+    """A map is not rounded twice, and not turned into float32 in between."""
     graph = onnx.load(made[1]).graph
     before = {output: node.op_type for node in graph.node for output in node.output}
     assert not [node for node in graph.node if node.op_type == "Clip"]
@@ -124,10 +119,8 @@ def test_a_light_stem_stays_exact_and_a_heavy_one_does_not(
 
 
 def test_no_sum_saturates(made: tuple[Path, Path, list[NDArray[np.uint8]]]) -> None:
-    """The same as in float32 arithmetic with the same rounded numbers, and near the float32
-    network's.
-    """
-    whole, small, pictures = made
+    """Results equal float32 arithmetic on the same rounded numbers."""
+    whole, small, images = made
     exact = SessionOptions()
     exact.add_session_config_entry("session.disable_quant_qdq", "1")
     sessions = [
@@ -135,10 +128,8 @@ def test_no_sum_saturates(made: tuple[Path, Path, list[NDArray[np.uint8]]]) -> N
         InferenceSession(str(small)),
         InferenceSession(str(small), exact),
     ]
-    for picture in pictures:
-        truth, found, expected = (
-            s.run(None, {signature.INPUT: picture[None]})[0] for s in sessions
-        )
+    for image in images:
+        truth, found, expected = (s.run(None, {signature.INPUT: image[None]})[0] for s in sessions)
         step = expected.max() / 255
         assert (
             np.abs(found - expected).max() <= 2.1 * step

@@ -1,4 +1,4 @@
-"""Graphs of other exporters, built here in their layout, are read as if they kept the contract."""
+"""Segmenter: ONNX files of other exporters, built here, are read like our own."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from torchvision.models.detection import MaskRCNN as TorchvisionMaskRCNN
 from cohdc_train.cli import main
 from cohdc_train.errors import ContractError
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.segmenter.adapters import MOST
+from cohdc_train.segmenter.adapters import MAX_DETECTIONS
 
 CANVAS = (64, 96)
 CLASSES = ("person", "dog", "car")
@@ -19,25 +19,21 @@ PROTOTYPES = 4
 
 
 def prototypes():
-    """[P, 16, 24]: everywhere, the left half, the upper half, and nowhere, as +-8 before the
-    sigmoid.
-    """
+    """Make [P, 16, 24] logits of +-8: everywhere, the left half, the upper half, nowhere."""
     maps = np.full((PROTOTYPES, CANVAS[0] // 4, CANVAS[1] // 4), -8.0, np.float32)
     maps[0], maps[1, :, :12], maps[2, :8] = 8, 8, 8
     return maps
 
 
 def candidate(box, label, score, prototype):
-    """A column [4 + C + P]; box: cx, cy, w, h in canvas px."""
+    """Make a column [4 + C + P]; box: cx, cy, w, h in canvas px."""
     scores, coefficients = np.zeros(len(CLASSES)), np.zeros(PROTOTYPES)
     scores[label], coefficients[prototype] = score, 1
     return np.concatenate([box, scores, coefficients])
 
 
 def yolo(path, table, names=CLASSES, free=False):
-    """A file whose candidates' boxes, scores and coefficients are `table` times the mean of the
-    image's red channel.
-    """
+    """Write a file whose candidates are `table` times the mean of the image's red channel."""
     table = np.asarray(table, np.float32)
     factor = np.ones_like(table)  # 1 where the table stands as it is
     if table.shape[0] == 4 + len(CLASSES) + PROTOTYPES:
@@ -94,7 +90,7 @@ def test_yolo_boxes_masks_labels_and_suppression(tmp_path):
         candidate([30, 20, 40, 24], 1, 0.4, 2),  # a dog where the car is
         candidate([60, 40, 10, 10], 1, 0.04, 0),  # below the threshold
     )
-    file = Segmenter(yolo(tmp_path / "y.onnx", table), threads=1)
+    file = Segmenter(yolo(tmp_path / "y.onnx", table), num_threads=1)
     assert file.class_names == CLASSES
     assert file.canvas == CANVAS
     found = file(red(128, 192))  # twice the canvas: no border
@@ -122,7 +118,7 @@ def test_yolo_takes_red_first_and_halves_of_255(tmp_path):
 
 @pytest.mark.parametrize("size", [(200, 200), (50, 300), (64, 64)])
 def test_yolo_letterbox_is_undone(tmp_path, size):
-    """A candidate that covers the content is the whole image; beyond it nothing reaches."""
+    """A candidate that covers the content is the whole image, clipped to it."""
     height, width = size
     scale = min(CANVAS[0] / height, CANVAS[1] / width)
     table = columns(
@@ -151,7 +147,7 @@ def test_yolo_finds_at_most_as_many_as_a_contract_file_and_may_find_none(tmp_pat
         )
     )
     found = Segmenter(yolo(tmp_path / "y.onnx", many))(red(64, 96))
-    assert len(found) == MOST
+    assert len(found) == MAX_DETECTIONS
     assert np.all(np.diff(found.scores) <= 0)
     nothing = Segmenter(yolo(tmp_path / "n.onnx", columns()))(red(64, 96))
     assert len(nothing) == 0
@@ -213,14 +209,14 @@ def test_an_image_to_image_graph_is_no_segmenter(tmp_path, shape):
         tmp_path / "i.onnx",
     )
     with pytest.raises(
-        ContractError, match="neither cohdc export nor a known foreign exporter wrote it"
+        ContractError, match="neither cohdc export nor another known exporter wrote it"
     ):
         Segmenter(tmp_path / "i.onnx")
 
 
 @pytest.fixture(scope="module")
 def torchvisions(opinionated):
-    """Torchvision's own detector around the small network's parts."""
+    """Make torchvision's own detector from the small network's parts."""
     backbone, heads = opinionated.backbone, opinionated.roi_heads
     backbone.out_channels = opinionated.config.fpn_channels
     return TorchvisionMaskRCNN(
@@ -253,7 +249,7 @@ def test_torchvisions_own_export_gives_what_torchvision_finds(torchvisions, tmp_
     (tmp_path / "torchvision.onnx.txt").write_text("person\ncar\n")
     with torch.inference_mode():
         expected = torchvisions([x])[0]
-    file = Segmenter(path, threads=1)
+    file = Segmenter(path, num_threads=1)
     assert file.canvas == (96, 128)
     found = file(image)
     scale = size[0] / 96

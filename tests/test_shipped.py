@@ -1,6 +1,4 @@
-"""The networks that come with the package: named, small, described by their cards, and they find
-people.
-"""
+"""Shipped networks: named, small, described by their cards, and they find people."""
 
 import json
 import re
@@ -35,7 +33,7 @@ def test_a_name_means_the_shipped_file_unless_there_is_a_file_of_that_name(
 
 @pytest.mark.parametrize(("name", "canvas"), CANVASES.items())
 def test_it_keeps_the_contract_and_is_small(name: str, canvas: tuple[int, int]) -> None:
-    segmenter = Segmenter(Path(name), threads=1)
+    segmenter = Segmenter(Path(name), num_threads=1)
     assert segmenter.class_names == ("person",)
     assert segmenter.canvas == canvas
     assert segmenter.cut_by_quality
@@ -58,16 +56,16 @@ def test_the_card_tells_the_stored_figures(name: str, size: str) -> None:
     }
     told = {key: float(rows[name]) for name, key in names.items()}
     assert told == {key: pytest.approx(stored["int8"][key], abs=5e-4) for key in names.values()}
-    for word in ("Licence", "COCO", "ImageNet", f"tools/experiments/person_model.py {size}"):
+    for word in ("License", "COCO", "ImageNet", f"tools/experiments/person_model.py {size}"):
         assert word in card
 
 
 @pytest.mark.parametrize("name", CANVASES)
 def test_it_finds_the_people_of_walking_xyz(name: str) -> None:
-    """Two in each photograph; the sixteenth is cut by the picture's edge."""
+    """Two people are in each photograph; the sixteenth is cut by the image's edge."""
     if not PHOTOS.is_dir():
         pytest.skip("needs TUM's photographs beside the repository")
-    segmenter = Segmenter(Path(name), threads=1)
+    segmenter = Segmenter(Path(name), num_threads=1)
     counts = []
     for file in sorted(PHOTOS.iterdir()):
         if (image := cv2.imread(str(file))) is not None:

@@ -1,6 +1,4 @@
-"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, and tells what it
-found.
-"""
+"""tools/experiments/slam_evaluation.py: renders once, runs what is missing, reports."""
 
 import json
 import sys
@@ -8,8 +6,10 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from slam_method import chosen_method
+from slam_settings import parse_settings
 from tool_loader import load_tool
+
+from cohdc_train.errors import DataError
 
 pytest.importorskip("embreex")
 
@@ -57,7 +57,7 @@ def test_rows_and_table(folder: Path) -> None:
         )
         assert row["ate_m"] == metrics["ate_m"]["rmse"]
         assert row["coverage"] == metrics["coverage"] == 1
-        assert row["method"]["loops"] is True  # type: ignore[index]
+        assert row["settings"] == {}
     table = (folder / "out" / "evaluation.md").read_text()
     assert f"| rolling_cart | {rows(folder)[0]['ate_m']:.4f} (" in table
     assert "100 %" in table
@@ -70,14 +70,14 @@ def test_what_is_there_is_neither_rendered_nor_run_again(
         raise AssertionError("made again")
 
     before = rows(folder)
-    monkeypatch.setattr(tool, "slam", refuse)
+    monkeypatch.setattr(tool, "run_slam", refuse)
     monkeypatch.setattr(tool, "sequence", refuse)
     call(tool, folder, "--modes", "none", "movers")
     assert rows(folder) == before
     with pytest.raises(AssertionError, match="made again"):
         call(tool, folder, "--modes", "none", "--seeds", "1")
     with pytest.raises(AssertionError, match="made again"):
-        call(tool, folder, "--modes", "none", "--method", "loops=false")
+        call(tool, folder, "--modes", "none", "--settings", "loops.enabled=false")
 
 
 def test_other_code_drops_old_rows(tool: ModuleType, folder: Path, tmp_path: Path) -> None:
@@ -87,12 +87,12 @@ def test_other_code_drops_old_rows(tool: ModuleType, folder: Path, tmp_path: Pat
     assert tool.kept(tmp_path / "nothing.json", "new") == []
 
 
-def test_switches_of_the_method() -> None:
-    assert chosen_method(["loops=false"]).loops is False
-    with pytest.raises(ValueError, match="'loop' is none of loops"):
-        chosen_method(["loop=false"])
-    with pytest.raises(ValueError, match="'perhaps' is no bool"):
-        chosen_method(["loops=perhaps"])
+def test_settings_are_checked() -> None:
+    assert parse_settings(["loops.enabled=false"]) == {"loops.enabled": False}
+    with pytest.raises(DataError, match=r"no option loop; did you mean loops\?"):
+        parse_settings(["loop.enabled=false"])
+    with pytest.raises(DataError, match=r"loops\.enabled is 'perhaps', not bool"):
+        parse_settings(["loops.enabled=perhaps"])
 
 
 def test_a_set_of_another_size_is_not_taken_for_this_one(tool: ModuleType, folder: Path) -> None:

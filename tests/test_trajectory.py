@@ -1,6 +1,4 @@
-"""Trajectory files and scores: known answers, invariances, the stored walking estimates, agreement
-with evo.
-"""
+"""Trajectory files and scores: known answers, invariances, agreement with evo."""
 
 import importlib.util
 import json
@@ -28,11 +26,11 @@ from cohdc_train.trajectory.metrics import (
     rpe,
     statistics,
 )
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 TUM = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum"
 needs_tum = pytest.mark.skipif(not TUM.is_dir(), reason=f"{TUM} is absent")
-WALKING = {  # ATE RMSE in metres, from the data's README
+WALKING = {  # ATE RMSE in meters, from the data's README
     "walking_xyz_a": 0.0144,
     "walking_xyz_b": 0.0159,
     "walking_xyz_c": 0.0202,
@@ -55,9 +53,7 @@ def rigid(rng: np.random.Generator) -> NDArray[np.float64]:
 def wander(
     rng: np.random.Generator, n: int = 40, rate: float = 10.0, noise: float = 0.0
 ) -> Trajectory:
-    """A smooth walk of the camera; with `noise` every pose is disturbed by that many metres and
-    radians.
-    """
+    """Make a smooth walk; `noise` disturbs each pose by that many meters and radians."""
     time = np.arange(n) / rate
     phases = np.arange(3)
     poses = np.tile(np.eye(4), (n, 1, 1))
@@ -72,9 +68,9 @@ def wander(
 
 def test_written_file_reads_back(tmp_path: Path) -> None:
     trajectory = wander(np.random.default_rng(1))
-    write_tum(tmp_path / "t.txt", trajectory)
-    back = read_tum(tmp_path / "t.txt")
-    assert np.array_equal(back.stamps, trajectory.stamps)
+    trajectory.save_tum(tmp_path / "t.txt")
+    back = Trajectory.load_tum(tmp_path / "t.txt")
+    assert np.array_equal(back.timestamps, trajectory.timestamps)
     assert np.abs(back.poses - trajectory.poses).max() < 1e-9
     assert [file.name for file in tmp_path.iterdir()] == ["t.txt"]
 
@@ -82,8 +78,8 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
 def test_comments_blank_lines_and_commas_are_read(tmp_path: Path) -> None:
     file = tmp_path / "t.txt"
     file.write_text("# a comment\n\n1.0, 1, 2, 3, 0, 0, 0, 2\n  # another\n2.5 4 5 6 0 0 1 0\n")
-    trajectory = read_tum(file)
-    assert trajectory.stamps.tolist() == [1.0, 2.5]
+    trajectory = Trajectory.load_tum(file)
+    assert trajectory.timestamps.tolist() == [1.0, 2.5]
     assert np.array_equal(
         trajectory.poses[0], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     )
@@ -107,7 +103,7 @@ def test_bad_file_is_refused_with_its_line(
     file = tmp_path / "bad.txt"
     file.write_text(text)
     with pytest.raises(DataError) as error:
-        read_tum(file)
+        Trajectory.load_tum(file)
     assert str(file) + place in str(error.value)
     assert fault in str(error.value)
     assert "\n" not in str(error.value)
@@ -115,7 +111,7 @@ def test_bad_file_is_refused_with_its_line(
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"absent\.txt"):
-        read_tum(tmp_path / "absent.txt")
+        Trajectory.load_tum(tmp_path / "absent.txt")
 
 
 def test_repeated_stamps_are_kept_and_said_aloud(
@@ -123,7 +119,7 @@ def test_repeated_stamps_are_kept_and_said_aloud(
 ) -> None:
     file = tmp_path / "t.txt"
     file.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
-    assert len(read_tum(file)) == 3
+    assert len(Trajectory.load_tum(file)) == 3
     assert "1 rows repeat" in caplog.text
 
 
@@ -167,13 +163,13 @@ def test_repeated_row_is_matched_as_its_stamp() -> None:
     truth = wander(np.random.default_rng(2), n=10)
     estimate = truth.take(np.array([0, 1, 1, 1, 2, 3]))
     matched_truth, matched = match(truth, estimate)
-    assert np.array_equal(matched_truth.stamps, matched.stamps)
+    assert np.array_equal(matched_truth.timestamps, matched.timestamps)
     assert len(matched) == 6
 
 
 def test_too_few_matches_are_refused() -> None:
     truth = wander(np.random.default_rng(3), n=10)
-    late = Trajectory(truth.stamps + 100, truth.poses)
+    late = Trajectory(truth.timestamps + 100, truth.poses)
     with pytest.raises(DataError, match="0 of 10 poses"):
         score(truth, late)
 
@@ -272,7 +268,10 @@ def test_identical_trajectories_have_no_error(seed: int) -> None:
 def test_scores_do_not_depend_on_the_world_frame(seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth, estimate = wander(rng), wander(rng, noise=0.05)
-    here, there = score(truth, estimate), score(truth.moved(rigid(rng)), estimate.moved(rigid(rng)))
+    here, there = (
+        score(truth, estimate),
+        score(truth.transformed(rigid(rng)), estimate.transformed(rigid(rng))),
+    )
     for key, row in here.items():
         assert there[key] == pytest.approx(row, rel=1e-6, abs=1e-9)
 
@@ -294,7 +293,7 @@ def test_no_small_motion_betters_the_alignment(seed: int) -> None:
     T = align_umeyama(estimate.positions, truth.positions)
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
     T[:3, 3] += rng.normal(0, 0.01, 3)
-    shifted = np.linalg.norm(estimate.moved(T).positions - truth.positions, axis=1)
+    shifted = np.linalg.norm(estimate.transformed(T).positions - truth.positions, axis=1)
     assert np.sqrt(np.mean(shifted**2)) >= best - 1e-12
 
 
@@ -323,12 +322,16 @@ def test_evaluate_prints_and_writes_the_same_numbers(
 ) -> None:
     rng = np.random.default_rng(10)
     truth, estimate = wander(rng), wander(rng, noise=0.02)
-    write_tum(tmp_path / "truth.txt", truth)
-    write_tum(tmp_path / "estimate.txt", estimate)
+    truth.save_tum(tmp_path / "truth.txt")
+    estimate.save_tum(tmp_path / "estimate.txt")
     result = evaluate(
         tmp_path / "truth.txt", tmp_path / "estimate.txt", out=tmp_path / "new" / "scores.json"
     )
     stored = json.loads((tmp_path / "new" / "scores.json").read_text())
+    names = {"groundtruth": "truth.txt", "estimate": "estimate.txt"}
+    assert {key: stored.pop(key) for key in names} == {
+        k: str(tmp_path / n) for k, n in names.items()
+    }
     assert stored == result
     assert set(stored) == {
         "ate_m",
@@ -350,8 +353,8 @@ def test_evaluate_prints_and_writes_the_same_numbers(
 
 def test_evaluate_names_the_estimate_that_does_not_match(tmp_path: Path) -> None:
     truth = wander(np.random.default_rng(11))
-    write_tum(tmp_path / "truth.txt", truth)
-    write_tum(tmp_path / "late.txt", Trajectory(truth.stamps + 99, truth.poses))
+    truth.save_tum(tmp_path / "truth.txt")
+    Trajectory(truth.timestamps + 99, truth.poses).save_tum(tmp_path / "late.txt")
     with pytest.raises(DataError, match=r"late\.txt: 0 of 40 poses lie within 0\.02 s"):
         evaluate(tmp_path / "truth.txt", tmp_path / "late.txt")
 
@@ -362,8 +365,8 @@ def test_evaluate_names_the_estimate_that_does_not_match(tmp_path: Path) -> None
 @needs_tum
 @pytest.mark.parametrize(("name", "expected"), WALKING.items())
 def test_stored_walking_estimates(name: str, expected: float) -> None:
-    truth = read_tum(TUM / "groundtruth" / f"fr3_{name[:-2]}.txt")
-    errors = ate(*match(truth, read_tum(TUM / "trajectories" / f"{name}.txt")))
+    truth = Trajectory.load_tum(TUM / "groundtruth" / f"fr3_{name[:-2]}.txt")
+    errors = ate(*match(truth, Trajectory.load_tum(TUM / "trajectories" / f"{name}.txt")))
     assert statistics(errors)["rmse"] == pytest.approx(expected, abs=1e-4)
 
 
@@ -376,9 +379,11 @@ for truth, estimate in zip(sys.argv[2::2], sys.argv[3::2]):
     pair = [file_interface.read_tum_trajectory_file(name) for name in (truth, estimate)]
     truth, estimate = sync.associate_trajectories(*pair, max_diff=0.02)
     row = {}
-    relations = {"m": metrics.PoseRelation.translation_part, "deg": metrics.PoseRelation.rotation_angle_deg}
+    angle = metrics.PoseRelation.rotation_angle_deg
+    relations = {"m": metrics.PoseRelation.translation_part, "deg": angle}
+    step = {"delta": int(sys.argv[1]), "delta_unit": metrics.Unit.frames, "all_pairs": True}
     for unit, relation in relations.items():
-        rpe = metrics.RPE(relation, delta=int(sys.argv[1]), delta_unit=metrics.Unit.frames, all_pairs=True)
+        rpe = metrics.RPE(relation, **step)
         rpe.process_data((truth, estimate))
         row["rpe_" + unit] = rpe.get_all_statistics()
     estimate.align(truth)
@@ -394,7 +399,7 @@ needs_evo = pytest.mark.skipif(
 
 
 def evo_says(home: Path, delta: int, files: list[Path]) -> list[dict[str, dict[str, float]]]:
-    """Ask evo, which is GPL and therefore only ever runs in a process of its own."""
+    """Ask evo, which is GPL and therefore runs in a process of its own."""
     environment = {**os.environ, "HOME": str(home), "MPLBACKEND": "Agg"}
     command = [sys.executable, "-c", EVO, str(delta), *map(str, files)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
@@ -405,12 +410,12 @@ def evo_says(home: Path, delta: int, files: list[Path]) -> list[dict[str, dict[s
 @needs_evo
 def test_evo_agrees_on_drawn_trajectories(tmp_path: Path) -> None:
     rng = np.random.default_rng(12)
-    truth, estimate = wander(rng, n=80), wander(rng, n=80, noise=0.03).moved(rigid(rng))
+    truth, estimate = wander(rng, n=80), wander(rng, n=80, noise=0.03).transformed(rigid(rng))
     files = [tmp_path / "truth.txt", tmp_path / "estimate.txt"]
-    write_tum(files[0], truth)
-    write_tum(files[1], estimate)
+    truth.save_tum(files[0])
+    estimate.save_tum(files[1])
     (evo,) = evo_says(tmp_path, 10, files)  # 10 frames of 0.1 s are the second
-    ours = score(*map(read_tum, files))
+    ours = score(*map(Trajectory.load_tum, files))
     for ours_key, evo_key in [("ate_m", "ate_m"), ("rpe_1s_m", "rpe_m"), ("rpe_1s_deg", "rpe_deg")]:
         assert ours[ours_key] == pytest.approx(
             {name: evo[evo_key][name] for name in ours[ours_key]}, abs=1e-6
@@ -429,10 +434,10 @@ def test_evo_agrees_on_the_stored_walking_estimates(tmp_path: Path) -> None:
     for (truth, estimate), evo in zip(
         zip(files[::2], files[1::2], strict=True), evo_says(tmp_path, 30, files), strict=True
     ):
-        matched = match(read_tum(truth), read_tum(estimate))
+        matched = match(Trajectory.load_tum(truth), Trajectory.load_tum(estimate))
         start = np.arange(len(matched[0]) - 30)
-        metres, degrees = rpe(*matched, np.stack([start, start + 30], axis=1))
-        ours = {"ate_m": ate(*matched), "rpe_m": metres, "rpe_deg": degrees}
+        meters, degrees = rpe(*matched, np.stack([start, start + 30], axis=1))
+        ours = {"ate_m": ate(*matched), "rpe_m": meters, "rpe_deg": degrees}
         for key, errors in ours.items():
             six = statistics(errors)
             assert six == pytest.approx({name: evo[key][name] for name in six}, abs=1e-6), (

@@ -1,4 +1,4 @@
-"""Tools have no ending, so that import does not find them."""
+"""Loader of files in tools/ as modules."""
 
 import sys
 from importlib.machinery import SourceFileLoader
@@ -12,7 +12,7 @@ TOOLS = Path(__file__).parents[1] / "tools"
 
 
 def load_tool(name: str) -> ModuleType:
-    """A file in tools/ as a module, run anew."""
+    """Load a file in tools/ as a new module."""
     loader = SourceFileLoader(name, str(TOOLS / name))
     module = module_from_spec(spec_from_loader(name, loader) or pytest.fail(f"no tools/{name}"))
     sys.modules[name] = module  # dataclasses look their module up

@@ -1,16 +1,17 @@
-"""What stands in a row of Table 4: a trained network or a finished model, exported and scored once."""
+"""Networks of Table 4's rows: trained or finished, exported and scored once."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from pycocotools import mask as rle
 
-from cohdc_train.bench.speed import LIKELY
-from cohdc_train.bench.training import Trained, train
-from cohdc_train.contour import simplify, trace, vertices
+from cohdc_train.bench.networks import NetworkBenchOptions
+from cohdc_train.bench.speed import MIN_SCORE
+from cohdc_train.bench.training import train
+from cohdc_train.contour import count_vertices, simplify, trace
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.errors import CohdcError
 from cohdc_train.exporter.export import export
@@ -25,25 +26,26 @@ ROWS = {  # the paper's, as shipped configurations
     "ResNet101": "networks/resnet101.yaml",
     "MobileNetV1": "networks/mobilenet_v1.yaml",
 }
-SCORES = {
+SCORES = {  # column of table4.json -> score of `cohdc validate`
     "ap": "segm_AP",
     "boundary_ap": "boundary_AP",
     "s90_matched": "S90_matched",
     "s90_all": "S90_all",
 }
-_IOU_FLOOR = 0.95  # of the polygons whose vertices are counted
+_MIN_POLYGON_IOU = 0.95  # of the polygons whose vertices are counted
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One network of a row.
+class ScoredNetwork:
+    """One network of a row, with its files and scores.
 
     Attributes:
-        name: of the row.
-        seed: of its training; None of a finished model.
-        checkpoint: None of an ONNX file.
-        files: "fps_ort" -> its ONNX file, "fps_ort_int8" -> the quantised one where there is one.
-        train_seconds: None of a finished model.
+        name: name of the row.
+        seed: seed of its training; None for a finished model.
+        checkpoint: None for an ONNX file.
+        files: "fps_ort" -> its ONNX file, and "fps_ort_int8" -> the quantized one where there is
+            one.
+        train_seconds: None for a finished model.
         scores: ap, boundary_ap, s90_matched, s90_all, vertices, and ap_int8 where there is an int8
             file.
     """
@@ -56,110 +58,109 @@ class Entry:
     scores: Mapping[str, float]
 
 
-def trained_entry(
-    row: str,
-    seed: int,
-    data: Path,
-    folder: Path,
-    options: Sequence[str],
-    weights: str | None,
-    threads: int,
-    int8: bool,
-) -> Entry:
-    """Train a row with a seed in a folder, or take what lies there.
+def train_row(
+    row: str, seed: int, data: Path, folder: Path, options: NetworkBenchOptions
+) -> ScoredNetwork:
+    """Train, export and score a row with one seed; finished steps in the folder are not repeated.
 
-    row: a name of ROWS or the YAML file of another network. Raises CohdcError when it is neither.
+    Args:
+        row: a name of ROWS, or the YAML file of another network.
+        seed: seed of the training.
+        data: COCO-format folder.
+        folder: where everything goes.
+        options: of the comparison.
+
+    Raises:
+        CohdcError: there is no such row, or a step failed.
     """
-    own = [f"--config={row_config(row)}", f"--seed_everything={seed}"]
-    own.append("--pretrained=none" if weights is None else f"--model.network.weights={weights}")
-    trained = train(folder, [data.resolve()], (*options, *own), threads)
-    return _exported(Path(row).stem, seed, trained, data, folder, threads, int8)
+    weights = (options.weights or {}).get(row)
+    start = "--pretrained=none" if weights is None else f"--model.network.weights={weights}"
+    own = [f"--config={row_config(row)}", f"--seed_everything={seed}", start]
+    run = train(folder, [data.resolve()], (*options.fit_arguments(), *own), options.threads)
+    files = _export_once(run.checkpoint, data, folder, options.int8)
+    scores = _score_once(files, data, folder / "scores.json", options.threads)
+    return ScoredNetwork(Path(row).stem, seed, run.checkpoint, files, run.seconds, scores)
 
 
 def row_config(row: str) -> Path:
-    """The configuration of a row. Raises CohdcError naming a row that there is not."""
+    """Return the configuration file of a row.
+
+    Raises:
+        CohdcError: there is no such row.
+    """
     try:
         return config_path(ROWS.get(row, row))
     except CohdcError as error:
-        raise CohdcError(
-            f"no row {row!r}; there are {', '.join(ROWS)}, and YAML files of networks"
-        ) from error
+        rows = ", ".join(ROWS)
+        raise CohdcError(f"no row {row!r}; there are {rows}, and YAML files of networks") from error
 
 
-def finished_entry(model: Path, data: Path, out: Path, threads: int, int8: bool) -> Entry:
-    """A checkpoint, exported into a folder below `out`, or an ONNX file as it is."""
+def score_model(model: Path, data: Path, out: Path, options: NetworkBenchOptions) -> ScoredNetwork:
+    """Score a finished model: an ONNX file, or a checkpoint, which is exported below `out`.
+
+    Raises:
+        CohdcError: there is no such file, or a step failed.
+    """
     model = model_path(model)
     if not model.is_file():
         raise CohdcError(f"{model}: no such file")
-    folder = (
-        out / f"model_{model.stem}_{sha256(model)[:8]}"
-    )  # most checkpoints are called best.ckpt
-    if model.suffix == ".onnx":
-        folder.mkdir(parents=True, exist_ok=True)
-        files = {"fps_ort": model}
-        return Entry(
-            model.name,
-            None,
-            None,
-            files,
-            None,
-            _scores(files, data, folder / "scores.json", threads),
-        )
-    return _exported(model.name, None, Trained(model, 0.0), data, folder, threads, int8)
+    # Most checkpoints are called best.ckpt, so the content is part of the name.
+    folder = out / f"model_{model.stem}_{sha256(model)[:8]}"
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = None if model.suffix == ".onnx" else model
+    files = {"fps_ort": model}
+    if checkpoint is not None:
+        files = _export_once(checkpoint, data, folder, options.int8)
+    scores = _score_once(files, data, folder / "scores.json", options.threads)
+    return ScoredNetwork(model.name, None, checkpoint, files, None, scores)
 
 
-def _exported(
-    name: str,
-    seed: int | None,
-    trained: Trained,
-    data: Path,
-    folder: Path,
-    threads: int,
-    int8: bool,
-) -> Entry:
-    file = folder / "model.onnx"
-    small = file.with_name("model.int8.onnx")
-    digest, kept = sha256(trained.checkpoint), folder / "exported.json"
-    there = all(path.is_file() for path in (kept, file, *([small] if int8 else [])))
-    if not (there and json.loads(kept.read_text()) == {"checkpoint": digest, "int8": int8}):
+def _export_once(checkpoint: Path, data: Path, folder: Path, int8: bool) -> dict[str, Path]:
+    """Export a checkpoint into a folder, unless its files lie there; returns them by column."""
+    file, int8_file = folder / "model.onnx", folder / "model.int8.onnx"
+    cache_file = folder / "exported.json"
+    request = {"checkpoint": sha256(checkpoint), "int8": int8}
+    needed = [cache_file, file, *([int8_file] if int8 else [])]
+    is_cached = all(path.is_file() for path in needed)
+    if not is_cached or json.loads(cache_file.read_text()) != request:
         images = CocoDataModule(data).folder.train[0].images[0].path.parent
-        export(
-            trained.checkpoint, file, images=images, int8=images if int8 else None, allow_drop=True
-        )
-        write_json(kept, {"checkpoint": digest, "int8": int8})
-    files = {"fps_ort": file} | ({"fps_ort_int8": small} if int8 else {})
-    seconds = None if seed is None else trained.seconds
-    scores = _scores(files, data, folder / "scores.json", threads)
-    return Entry(name, seed, trained.checkpoint, files, seconds, scores)
+        calibration = images if int8 else None
+        export(checkpoint, file, images=images, int8=calibration, allow_drop=True)
+        write_json(cache_file, request)
+    files = {"fps_ort": file}
+    if int8:
+        files["fps_ort_int8"] = int8_file
+    return files
 
 
-def _scores(files: Mapping[str, Path], data: Path, kept: Path, threads: int) -> dict[str, float]:
-    """Scores of the files, kept with what they were made from."""
+def _score_once(
+    files: Mapping[str, Path], data: Path, cache_file: Path, threads: int
+) -> dict[str, float]:
+    """Score the files, unless the cache holds the scores of the same files and data."""
     made_from = {name: sha256(path) for name, path in files.items()} | {"data": str(data.resolve())}
-    if kept.is_file():
-        known = json.loads(kept.read_text())
-        if known["made_from"] == made_from:
-            scores: dict[str, float] = known["scores"]
-            return scores
+    if cache_file.is_file():
+        cached = json.loads(cache_file.read_text())
+        if cached["made_from"] == made_from:
+            return dict(cached["scores"])
+
     results = score_file(files["fps_ort"], data, threads=threads)
     scores = {column: results.scores[score] for column, score in SCORES.items()}
     scores["vertices"] = mean_vertices(results)
     if "fps_ort_int8" in files:
-        scores["ap_int8"] = score_file(files["fps_ort_int8"], data, threads=threads).scores[
-            "segm_AP"
-        ]
-    write_json(kept, {"made_from": made_from, "scores": scores})
+        int8_results = score_file(files["fps_ort_int8"], data, threads=threads)
+        scores["ap_int8"] = int8_results.scores["segm_AP"]
+    write_json(cache_file, {"made_from": made_from, "scores": scores})
     return scores
 
 
 def mean_vertices(results: Results) -> float:
-    """Vertices of a likely detection's outline behind BAS-DP at an IoU of .95; nan without a
-    detection.
+    """Count the vertices of likely detections' BAS-DP polygons at an IoU of 0.95.
+
+    Returns:
+        The mean over the detections; nan without a detection.
     """
-    masks = [
-        rle.decode(row["segmentation"]).astype(np.bool_)
-        for row in results.rows
-        if row["score"] >= LIKELY
-    ]
-    counts = [vertices(simplify(trace(mask), _IOU_FLOOR, "bas_dp")) for mask in masks if mask.any()]
+    likely = [row for row in results.rows if row["score"] >= MIN_SCORE]
+    masks = [rle.decode(row["segmentation"]).astype(np.bool_) for row in likely]
+    polygons = [simplify(trace(mask), _MIN_POLYGON_IOU, "bas_dp") for mask in masks if mask.any()]
+    counts = [count_vertices(polygon) for polygon in polygons]
     return float(np.mean(counts)) if counts else float("nan")

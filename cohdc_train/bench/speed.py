@@ -1,10 +1,9 @@
-"""How fast networks are from image to masks, in turn on the same pictures, and how much memory they
-take.
-"""
+"""Speed of networks from image to masks, taking turns on the same images, and their memory."""
 
 import statistics
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,15 +12,16 @@ import numpy as np
 import torch
 
 from cohdc_train.errors import CohdcError
-from cohdc_train.exporter.interleaved_timing import Image, K, seconds_in_turn
+from cohdc_train.exporter.interleaved_timing import K, time_interleaved
 from cohdc_train.models import detect
 from cohdc_train.segmenter import Detections, Segmenter
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.types import Image
 
 Runner = Callable[[Image], Detections]
 
-LIKELY = 0.5  # score from which a detection's mask is pasted
-_PEAK = """
+MIN_SCORE = 0.5  # detections below are not pasted into full-size masks
+_PEAK_MEMORY_PROGRAM = """
 import resource, sys
 from pathlib import Path
 import numpy as np
@@ -39,7 +39,7 @@ else:
 
 
 class Rate(NamedTuple):
-    """Pictures per second: the median over the pictures, and the quartiles."""
+    """Images per second: the median over the images, and the quartiles."""
 
     median: float
     low: float
@@ -47,36 +47,37 @@ class Rate(NamedTuple):
 
 
 def torch_runner(checkpoint: Path) -> Runner:
-    """A checkpoint's network in torch, float32, in evaluation mode, read as the ONNX file is."""
+    """Load a checkpoint's network in torch, float32, to be called like a `Segmenter`."""
     module = MaskRCNNModule.load(checkpoint)
-    names = tuple(module.class_names)
+    class_names = tuple(module.class_names)
 
     def run(rgb: Image) -> Detections:
         with torch.inference_mode():
             found = detect(module.network, [torch.from_numpy(rgb).permute(2, 0, 1)])[0]
-        boxes, labels, scores, quality, masks = (
-            found[name].numpy() for name in ("boxes", "labels", "scores", "quality", "masks")
-        )
+        names = ("boxes", "labels", "scores", "quality", "masks")
+        boxes, labels, scores, quality, masks = (found[name].numpy() for name in names)
         height, width = rgb.shape[:2]
-        return Detections(boxes, labels, scores, quality, masks, (height, width), names)
+        return Detections(boxes, labels, scores, quality, masks, (height, width), class_names)
 
     return run
 
 
-def frame_rates(runners: Mapping[K, Runner], pictures: Sequence[Image]) -> dict[K, Rate]:
-    """Frames per second of each runner, in turn, from uint8 [H, W, 3] to the masks of its likely
-    detections.
+def frame_rates(runners: Mapping[K, Runner], images: Sequence[Image]) -> dict[K, Rate]:
+    """Measure images per second from uint8 [H, W, 3] to full-size masks of likely detections.
+
+    The runners take turns on each image.
     """
-    whole = {name: _to_masks(run) for name, run in runners.items()}
-    return {name: _rate(taken) for name, taken in seconds_in_turn(whole, pictures).items()}
+    to_masks = {name: _with_masks(run) for name, run in runners.items()}
+    seconds = time_interleaved(to_masks, images)
+    return {name: _rate(times) for name, times in seconds.items()}
 
 
-def _to_masks(run: Runner) -> Callable[[Image], None]:
-    def whole(rgb: Image) -> None:
-        found = run(rgb)
-        found.select(found.scores >= LIKELY).masks()
+def _with_masks(run: Runner) -> Callable[[Image], None]:
+    def run_to_masks(rgb: Image) -> None:
+        detections = run(rgb)
+        detections.select(detections.scores >= MIN_SCORE).masks()
 
-    return whole
+    return run_to_masks
 
 
 def _rate(seconds: Sequence[float]) -> Rate:
@@ -84,30 +85,49 @@ def _rate(seconds: Sequence[float]) -> Rate:
     return Rate(1 / float(median), 1 / float(low), 1 / float(high))
 
 
-def peak_memory(file: Path, picture: Path, threads: int) -> float:
-    """MiB that a process of its own takes at most, onnxruntime and numpy included, when it runs a
-    file on a picture.
+def peak_memory(model: Path, image: Image, threads: int) -> float:
+    """Measure the peak memory of a process that runs an ONNX file on an image.
 
-    picture: a .npy file of uint8 [H, W, 3]. Raises CohdcError when the process fails.
+    Args:
+        model: the ONNX file.
+        image: uint8 [H, W, 3].
+        threads: number of threads of onnxruntime.
+
+    Returns:
+        MiB, onnxruntime and numpy included.
+
+    Raises:
+        CohdcError: the process fails.
     """
-    command = [sys.executable, "-c", _PEAK, str(file), str(threads), str(picture)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    with tempfile.TemporaryDirectory() as folder:
+        image_file = Path(folder) / "image.npy"
+        np.save(image_file, image)
+        arguments = [str(model), str(threads), str(image_file)]
+        command = [sys.executable, "-c", _PEAK_MEMORY_PROGRAM, *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise CohdcError(f"{file}: does not run by itself: {done.stderr.strip().splitlines()[-1]}")
+        reason = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+        raise CohdcError(f"{model}: does not run by itself: {reason}")
     return int(done.stdout) / 2**20
 
 
-def spread(values: Sequence[float]) -> tuple[float, float, float]:
-    """Median, smallest and largest."""
+def median_and_range(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the median, the smallest and the largest value."""
     return statistics.median(values), min(values), max(values)
 
 
-def runners_of(
+def make_runners(
     checkpoint: Path | None, files: Mapping[str, Path], threads: int
 ) -> dict[str, Runner]:
-    """`fps_torch` of a checkpoint and one runner of each file, by the names of table4.json's
-    columns.
+    """Make `fps_torch` of a checkpoint and one runner of each file, named as table4.json's columns.
+
+    Args:
+        checkpoint: None for a row without one.
+        files: column of table4.json -> ONNX file.
+        threads: number of threads of torch and onnxruntime.
     """
     torch.set_num_threads(threads)
-    found: dict[str, Runner] = {} if checkpoint is None else {"fps_torch": torch_runner(checkpoint)}
-    return found | {name: Segmenter(path, threads) for name, path in files.items()}
+    runners: dict[str, Runner] = {}
+    if checkpoint is not None:
+        runners["fps_torch"] = torch_runner(checkpoint)
+    return runners | {name: Segmenter(path, threads) for name, path in files.items()}

@@ -1,292 +1,62 @@
 """Beetle antennae search over the vertices of an outline (paper 2.1.3, equation 2)."""
 
 from collections.abc import Iterable
-from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
 
-from cohdc_train.contour.polygon_iou import Coverage
-from cohdc_train.contour.polygons import FloatArray, IntArray, Polygon, vertices
+from cohdc_train.contour.beetle_parameters import BeetleSearch
+from cohdc_train.contour.polygon_iou import IoUEvaluator
+from cohdc_train.contour.polygons import Polygon, count_vertices
+from cohdc_train.contour.vertex_swarm import VertexSwarm
+from cohdc_train.types import IntArray
 
-_MOST_VERTICES = 2000  # behind bisection; an outline of more is kept as it is
-_AT_A_TIME = 8  # at first, of so many vertices one is dropped
-_LONG = 6  # vertices of a ring of which at least three are left when every other one is dropped
-_DENSE = 10  # of an outline with many vertices one of so many is tried before the search ends
-_ROOM = 0.35  # of the shorter of its edges: further no vertex moves at a time
-
-
-@dataclass(frozen=True)
-class BeetleSearch:
-    """Parameters of the beetle antennae search, named as the paper names them.
-
-    Attributes:
-        S: step, the length of the first move behind a dropped vertex, px.
-        H: attenuation of the step with every move.
-        c: ratio of the step to the whiskers' length d_0 = S / c.
-        n: most moves behind a dropped vertex; when they do not lead back to the floor, the vertex
-            stays.
-        pairs: whiskers of a beetle, in pairs of opposite directions; the paper's has one.
-        tries: vertices that are tried before the search ends, those that are missed least first;
-            more of an outline with many.
-        seed: of the random directions.
-
-    The paper's k, the number of parameters, is 2 for every beetle: a vertex. All of them together
-    have twice the vertices.
-    """
-
-    S: float = 3.0
-    H: float = 0.8
-    c: float = 1.0
-    n: int = 8
-    pairs: int = 4
-    tries: int = 2
-    seed: int = 0
-
-    @property
-    def steps(self) -> list[float]:
-        """The length of every move, px."""
-        return [self.S * self.H**k for k in range(self.n)]
+_MAX_VERTICES = 2000  # after bisection; an outline of more is not searched
+_DROP_ONE_OF = 8  # vertices, at first
+_TRY_ONE_OF = 10  # vertices, before the search ends
 
 
 def search_vertices(
-    finer: list[Polygon], iou_floor: float, coverage: Coverage, search: BeetleSearch
+    finer: list[Polygon], iou_floor: float, evaluator: IoUEvaluator, search: BeetleSearch
 ) -> list[Polygon]:
-    """Drop vertices and move the others while the floor is kept.
+    """Drop vertices and move the others while the floor of the IoU is kept.
 
-    Of an outline with many vertices several go at a time, until that fails. When not one can be
-    dropped, all move for a higher IoU. Then there is another round, which ends the search when it
-    drops nothing.
+    Of an outline with many vertices several are dropped together, until that fails. When no vertex
+    can be dropped, all move for a higher IoU. Then there is another round, which ends the search
+    when it drops nothing.
 
-    finer: polygons that keep the floor. Returns the last ones that keep it and do not cross
-    themselves.
+    Args:
+        finer: polygons that keep the floor.
+        iou_floor: smallest IoU, 0..1.
+        evaluator: compares polygons with the outline.
+        search: parameters.
+
+    Returns:
+        The last polygons that keep the floor and do not cross themselves.
     """
-    if vertices(finer) > _MOST_VERTICES:
+    if count_vertices(finer) > _MAX_VERTICES:
         return finer
     rng = np.random.default_rng(search.seed)
-    beetles, moved = _Beetles(finer, coverage, search.pairs), False
+    swarm, moved = VertexSwarm(finer, evaluator, search.pairs), False
 
-    def without_one_of(choices: Iterable[tuple[IntArray, int]]) -> "_Beetles | None":
+    def without_one_of(choices: Iterable[tuple[IntArray, int]]) -> "VertexSwarm | None":
         for dropped, added in choices:
-            fewer = beetles.without(dropped, added)
-            if fewer.settle(iou_floor, search, rng) and coverage.valid(fewer.polygons()):
+            fewer = swarm.without(dropped, added)
+            if fewer.move_until_valid(iou_floor, search, rng) and evaluator.is_valid(
+                fewer.polygons()
+            ):
                 return fewer
         return None
 
-    while (count := beetles.count // _AT_A_TIME) > 1 and (
-        fewer := without_one_of(beetles.missed_together(count))
+    while (count := swarm.count // _DROP_ONE_OF) > 1 and (
+        fewer := without_one_of(swarm.joint_removals(count))
     ):
-        beetles = fewer
+        swarm = fewer
     while True:
-        tries = 1 if moved else max(search.tries, beetles.count // _DENSE)
-        if fewer := without_one_of(beetles.least_missed(tries)):
-            beetles, moved = fewer, False
+        tries = 1 if moved else max(search.tries, swarm.count // _TRY_ONE_OF)
+        if fewer := without_one_of(swarm.cheapest_removals(tries)):
+            swarm, moved = fewer, False
             continue
-        better = beetles if moved else beetles.moved(search, rng)
-        if moved or better.iou() < beetles.iou() or not coverage.valid(better.polygons()):
-            return beetles.polygons()
-        beetles, moved = better, True
-
-
-class _Beetles:
-    """The vertices of all rings, each the head of a beetle.
-
-    A beetle's f is what its two edges add to the pixels that only one of outline and polygons has.
-    Neighbours do not move at the same time, so that the sum falls by what each of them gains.
-    """
-
-    def __init__(self, polygons: list[Polygon], coverage: Coverage, pairs: int) -> None:
-        rings = [ring for polygon in polygons for ring in polygon.rings]
-        self._coverage = coverage
-        self._spread = np.arange(pairs)[:, None] * np.pi / pairs
-        self._owner = np.array(
-            [k for k, polygon in enumerate(polygons) for _ in polygon.rings]
-        )  # of every ring
-        self._sizes = np.array([len(ring) for ring in rings])
-        self._x = np.concatenate(rings)  # [V, 2]
-        self._link()
-        _, self._apart = coverage.counts(*self._edges())
-
-    def _link(self) -> None:
-        """Neighbours of every vertex, its place in its ring and the ring's size."""
-        ends = np.cumsum(self._sizes)
-        starts = ends - self._sizes
-        index = np.arange(len(self._x))
-        self._before, self._after = index - 1, index + 1
-        self._before[starts], self._after[ends - 1] = ends - 1, starts
-        self._size = self._sizes.repeat(self._sizes)
-        self._place = index - starts.repeat(self._sizes)
-
-    @property
-    def count(self) -> int:
-        """How many vertices there are."""
-        return len(self._before)
-
-    def _edges(self) -> tuple[FloatArray, FloatArray]:
-        return self._x, self._x.take(self._after, axis=0)
-
-    def _turns(self, first: int) -> list[IntArray]:
-        """Two sets without neighbours among them; of an odd ring one vertex is in none, another for
-        every `first`.
-        """
-        place = (self._place + first) % self._size
-        odd = place % 2 == 1
-        return [np.flatnonzero(odd), np.flatnonzero(~odd & (place < self._size - 1))]
-
-    def _f(self, index: IntArray, heads: FloatArray) -> IntArray:
-        """f of beetles [m] with their heads at [p, m, 2]: [p, m]."""
-        start, end = np.empty((2, 2, *heads.shape))  # [edge, p, m, 2]
-        start[0] = self._x.take(self._before.take(index), axis=0)
-        start[1] = self._x.take(self._after.take(index), axis=0)
-        end[:] = heads
-        added = self._coverage.difference(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(
-            2, *heads.shape[:2]
-        )
-        f: IntArray = added[0] - added[1]
-        return f
-
-    def move(self, step: float, whisker: float, first: int, rng: np.random.Generator) -> None:
-        """One move of every beetle by equation 2; a head goes to the best of the places that were
-        felt.
-
-        step: length of the move, px; whisker: d_0, px; both are shorter where edges are short, so
-        that rings cross less often. first: where the first turn begins. The equation's second line
-        has `step` where the right whisker stands; both are d_0 long here. The paper's head walks on
-        from a worse place too, this one stays.
-        """
-        start, end = self._edges()
-        along = np.hypot(*(end - start).T)
-        room = np.minimum(1, _ROOM * np.minimum(along, along[self._before]) / step)
-        angle = rng.uniform(0, np.pi, len(room)) + self._spread
-        b = (room * np.exp(1j * angle)).view(np.float64).reshape(*angle.shape, 2)  # [pairs, V, 2]
-        pairs = len(angle)
-        places = np.empty((1 + 2 * pairs, *self._x.shape))
-        places[:] = self._x
-        places[1 : 1 + pairs] += whisker * b
-        places[1 + pairs :] -= whisker * b
-        places[1:] = self._coverage.nearest(places[1:])
-        for index in self._turns(first):
-            felt, every = places.take(index, axis=1), np.arange(len(index))
-            f = self._f(index, felt)
-            if step != whisker:
-                left, right = f[1 : 1 + pairs], f[1 + pairs :]
-                best = np.minimum(left, right).argmin(0)
-                towards = b[best, index] * np.sign(left - right)[best, every][:, None]
-                moved = self._coverage.nearest(self._x[index] - step * towards)[None]
-                felt, f = np.concatenate([felt, moved]), np.concatenate([f, self._f(index, moved)])
-            best = f.argmin(0)
-            self._apart += int((f[best, every] - f[0]).sum())
-            self._x[index] = felt[best, every]
-
-    def settle(self, iou_floor: float, search: BeetleSearch, rng: np.random.Generator) -> bool:
-        """Move until the floor is kept; False when it is not after n moves, or will not be as far
-        as one can tell.
-        """
-        ious = [self.iou_about()]
-        for k, step in enumerate(search.steps):
-            if ious[-1] >= iou_floor and self.iou() >= iou_floor:
-                return True
-            if (
-                k > 1 and 2 * ious[-1] - ious[-3] < iou_floor
-            ):  # moves to come are worth less than the last two
-                return False
-            self.move(step, step / search.c, k, rng)
-            ious.append(self.iou_about())
-        return ious[-1] >= iou_floor and self.iou() >= iou_floor
-
-    def moved(self, search: BeetleSearch, rng: np.random.Generator) -> "_Beetles":
-        """The same after n / 2 moves."""
-        other = copy(self)
-        other._x = self._x.copy()
-        for k, step in enumerate(search.steps[::2]):
-            other.move(step, step / search.c, k, rng)
-        return other
-
-    def least_missed(self, most: int) -> list[tuple[IntArray, int]]:
-        """Vertices that may be dropped, and what that adds to the sum; first what is missed least
-        for its number.
-
-        One by one, but for triangles: as a whole, if they are no outer ring with holes nor the last
-        outer ring.
-        """
-        start, end = self._edges()
-        ends = np.cumsum(self._sizes)
-        around, across = self._coverage.difference(
-            np.concatenate([start, start[self._before]]), np.concatenate([end, end])
-        ).reshape(2, -1)
-        missed = (across - around - around[self._before]).astype(np.float64)
-        for ring in np.flatnonzero(self._sizes == 3).tolist():
-            first = ends[ring] - 3
-            missed[first : first + 3] = (
-                -around[first : first + 3].sum() / 3 if self._spare(ring) else np.inf
-            )
-            missed[first + 1 : first + 3] = np.inf
-        order = np.argsort(missed, kind="stable")[:most]
-        counts = np.where(self._size[order] == 3, 3, 1)
-        return [
-            (np.arange(i, i + count), round(count * missed[i]))
-            for i, count in zip(order.tolist(), counts.tolist(), strict=True)
-            if np.isfinite(missed[i])
-        ]
-
-    def missed_together(self, count: int) -> list[tuple[IntArray, int]]:
-        """`count` vertices to drop at a time, least missed and no neighbours, and what that adds;
-        none if too few.
-        """
-        chosen: list[int] = []
-        total, near = 0, set[int]()
-        for (first, *_), added in self.least_missed(2 * count):
-            i = int(first)
-            if self._size[i] >= _LONG and i not in near:
-                chosen.append(i)
-                total += added
-                near |= {int(self._before[i]), int(self._after[i])}
-            if len(chosen) == count:
-                return [(np.sort(chosen), total)]
-        return []
-
-    def _spare(self, ring: int) -> bool:
-        """Whether a ring may go as a whole."""
-        owner = self._owner
-        if ring and owner[ring - 1] == owner[ring]:
-            return True
-        return owner[0] != owner[-1] and not (
-            ring + 1 < len(owner) and owner[ring + 1] == owner[ring]
-        )
-
-    def without(self, dropped: IntArray, added: int) -> "_Beetles":
-        """All but some vertices, and all but rings that have none left. added: to the sum, as
-        `least_missed` has it.
-        """
-        fewer = copy(self)
-        sizes = self._sizes - np.bincount(
-            np.searchsorted(np.cumsum(self._sizes), dropped, "right"), minlength=len(self._sizes)
-        )
-        kept = sizes > 0
-        fewer._sizes, fewer._owner = sizes[kept], self._owner[kept]
-        stays = np.ones(len(self._x), np.bool_)
-        stays[dropped] = False
-        fewer._x = self._x[stays]
-        fewer._link()
-        fewer._apart += added
-        return fewer
-
-    def iou(self) -> float:
-        """With the outline, 0..1."""
-        return self._coverage.iou_of(*self._edges())
-
-    def iou_about(self) -> float:
-        """The same from what f has added up to and the rings' areas, not their pixels: a fifth of
-        the time.
-        """
-        start, end = self._edges()
-        twice = float(np.vdot(start[:, 0], end[:, 1]) - np.vdot(start[:, 1], end[:, 0]))
-        return self._coverage.iou_about(abs(twice) / 2, self._apart)
-
-    def polygons(self) -> list[Polygon]:
-        """What the beetles stand around."""
-        parts: dict[int, list[FloatArray]] = {}
-        ends = np.cumsum(self._sizes).tolist()
-        for owner, start, end in zip(self._owner.tolist(), [0, *ends], ends, strict=False):
-            parts.setdefault(owner, []).append(self._x[start:end])
-        return [Polygon(outer, tuple(holes)) for outer, *holes in parts.values()]
+        better = swarm if moved else swarm.moved(search, rng)
+        if moved or better.iou() < swarm.iou() or not evaluator.is_valid(better.polygons()):
+            return swarm.polygons()
+        swarm, moved = better, True

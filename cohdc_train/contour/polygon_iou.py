@@ -1,4 +1,4 @@
-"""How well polygons cover an outline, told by where edges cross the columns of pixels."""
+"""IoU of polygons with an outline, from where their edges cross the columns of pixels."""
 
 from collections.abc import Sequence
 from functools import cache, cached_property
@@ -7,52 +7,55 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.contour.polygons import CENTRE, FloatArray, IntArray, Polygon, crossings, edges
+from cohdc_train.contour.polygons import CENTER, Polygon, crossings, edges
+from cohdc_train.types import FloatArray, Int32Array, IntArray, Mask
 
-_PER_PX = 5  # places for a vertex along a px: one decimal in a file, and the grid that COCO's tools fill on
+_PER_PX = 5  # places of a vertex per px: the grid that COCO's tools fill on
 
 
-class Coverage:
-    """The outline that simpler ones are compared with, on the grid of its bounds.
+class IoUEvaluator:
+    """Compares simpler polygons with an outline, on the grid of the outline's bounds.
 
-    Nothing is filled. A crossing with a column's centre line has a place, which counts rows down
+    Nothing is filled. A crossing with a column's center line has a place, which counts rows down
     the columns one after another. Between the first place and the second, the third and the fourth
-    and so on in their order lie the pixels
-    inside: the even-odd rule. Places of two outlines together enclose the pixels that only one of
-    them has.
+    and so on, in their order, lie the pixels inside: the even-odd rule. Places of two outlines
+    together enclose the pixels that only one of them has.
+
+    Attributes:
+        low: [2] px, upper left of the bounds.
+        high: [2] px, lower right of the bounds.
+        area: pixels of the outline.
     """
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
+        """Take the polygons of an outline, as `trace` gives them."""
         rings = [ring for polygon in polygons for ring in polygon.rings]
         start, end = edges(rings)
         axes = np.ascontiguousarray(start.T)
         self.low, self.high = np.floor(axes.min(1)), np.ceil(axes.max(1))
-        self._first_centre = self.low + CENTRE
+        self._first_center = self.low + CENTER
         self._width, height = (self.high - self.low).astype(int).tolist()
         self._rows = height + 1  # places in a column
-        across = np.flatnonzero(
-            start[:, 0] != end[:, 0]
-        )  # of a traced outline half the edges run along columns
-        self._places = np.sort(
-            self._crossed(start.take(across, axis=0), end.take(across, axis=0))[0]
-        )
+        # half the edges of a traced outline run along columns
+        across = np.flatnonzero(start[:, 0] != end[:, 0])
+        places, _, _ = self._crossed(start.take(across, axis=0), end.take(across, axis=0))
+        self._places = np.sort(places)
         self.area = _enclosed(self._places)
-        self._sign = _turn(polygons[0].outer)
+        self._sign = _orientation(polygons[0].outer)
 
     def iou(self, polygons: Sequence[Polygon]) -> float:
-        """IoU, 0..1, of polygons that lie within the bounds, as they are filled by the even-odd
-        rule.
-        """
+        """Return the IoU, 0..1, with polygons within the bounds, filled by the even-odd rule."""
         rings = [ring for polygon in polygons for ring in polygon.rings]
-        return self.iou_of(*edges(rings)) if rings else 0.0
+        return self.iou_of_edges(*edges(rings)) if rings else 0.0
 
-    def iou_of(self, start: FloatArray, end: FloatArray) -> float:
-        """The same of closed rings, given as edges [E, 2] -> [E, 2]."""
-        return self.iou_about(*self.counts(start, end))
+    def iou_of_edges(self, start: FloatArray, end: FloatArray) -> float:
+        """Return the IoU, 0..1, with closed rings, given as edges [E, 2] -> [E, 2]."""
+        return self.approximate_iou(*self.count_pixels(start, end))
 
-    def counts(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
-        """Pixels that closed rings cover, and that only they or the outline have; edges [E, 2] ->
-        [E, 2].
+    def count_pixels(self, start: FloatArray, end: FloatArray) -> tuple[int, int]:
+        """Count the pixels that closed rings cover, and those that only they or the outline have.
+
+        The rings are given as edges [E, 2] -> [E, 2].
         """
         places = self._crossed(start, end)[0]
         both = np.concatenate((self._places, places))
@@ -60,15 +63,15 @@ class Coverage:
         both.sort()
         return _enclosed(places), _enclosed(both)
 
-    def iou_about(self, covered: float, apart: int) -> float:
-        """IoU of what covers so many pixels, so many of which only one of it and the outline has."""
+    def approximate_iou(self, covered: float, apart: int) -> float:
+        """Return the IoU with polygons that cover so many pixels, of which `apart` differ."""
         return (self.area + covered - apart) / (self.area + covered + apart)
 
-    def difference(self, start: FloatArray, end: FloatArray) -> IntArray:
-        """What edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
+    def count_added_pixels(self, start: FloatArray, end: FloatArray) -> IntArray:
+        """Count what edges [E, 2] -> [E, 2] add to the pixels that only one of the two has: [E].
 
-        Less a constant per column, which is the same for all ways from one point to another; of
-        rings that do not cross themselves and turn as they were traced.
+        A constant per column is missing, which is the same for all paths from one point to another.
+        It holds for rings that do not cross themselves and keep the orientation of the traced ones.
         """
         places, first, run = self._crossed(start, end)
         alone = np.zeros(len(places) + 1, np.int32)
@@ -77,31 +80,28 @@ class Coverage:
         return added
 
     @cached_property
-    def _alone(self) -> NDArray[np.int32]:
-        """Rows above every place less twice the outline's pixels above it."""
+    def _alone(self) -> Int32Array:
+        """Rows above every place, less twice the outline's pixels above it."""
         hits = np.zeros(self._width * self._rows, np.uint8)
         np.add.at(hits, self._places.astype(np.int64), 1)
         inside = np.bitwise_xor.accumulate(hits) & 1
         alone = np.arange(len(hits), dtype=np.int32)
         alone[1:] -= 2 * np.cumsum(inside[:-1], dtype=np.int32)
         columns = alone.reshape(self._width, self._rows)
-        signed: NDArray[np.int32] = ((columns - columns[:, :1]) * self._sign).ravel()
+        signed: Int32Array = ((columns - columns[:, :1]) * self._sign).ravel()
         return signed
 
     def _crossed(self, start: FloatArray, end: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
-        """Places where edges cross the columns, the first of every edge, and the columns it runs
-        along.
-        """
-        places, row, first, run = crossings(start, end, self._first_centre)
+        """Return the places where edges cross columns, the first of every edge, and its columns."""
+        places, row, first, run = crossings(start, end, self._first_center)
         places *= self._rows
         places += row
         return places, first, run
 
-    def nearest(self, points: FloatArray) -> FloatArray:
-        """Points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
-        placed: FloatArray = (
-            points * _PER_PX
-        )  # exact for what is traced, so that halves go the same way everywhere
+    def snap_to_grid(self, points: FloatArray) -> FloatArray:
+        """Return points [..., 2] moved onto the grid of fifths and into the outline's bounds."""
+        # exact for traced points, so that halves are rounded the same way everywhere
+        placed: FloatArray = points * _PER_PX
         placed += 0.5
         np.floor(placed, out=placed)
         placed /= _PER_PX
@@ -110,39 +110,40 @@ class Coverage:
             np.clip(line, self.low[axis], self.high[axis], out=line)
         return placed
 
-    def valid(self, polygons: Sequence[Polygon]) -> bool:
-        """Whether no ring crosses another or itself, and all turn as the outline's do: holes
-        against outer rings.
+    def is_valid(self, polygons: Sequence[Polygon]) -> bool:
+        """Return whether no rings cross, and all have the orientation of the outline's rings.
+
+        Holes have the opposite one.
         """
         for polygon in polygons:
-            if _turn(polygon.outer) != self._sign or any(
-                _turn(hole) != -self._sign for hole in polygon.holes
+            if _orientation(polygon.outer) != self._sign or any(
+                _orientation(hole) != -self._sign for hole in polygon.holes
             ):
                 return False
-        return not crossing([ring for polygon in polygons for ring in polygon.rings])
+        return not rings_cross([ring for polygon in polygons for ring in polygon.rings])
 
 
 def _enclosed(places: FloatArray) -> int:
-    """Pixels between places in order."""
+    """Count the pixels between places in order."""
     return int(_signs(len(places).bit_length())[: len(places)] @ places)
 
 
 @cache
 def _signs(bits: int) -> FloatArray:
-    """-1, 1, -1, 1 and so on, 2^bits of them."""
+    """Return -1, 1, -1, 1 and so on, 2^bits of them."""
     return np.tile([-1.0, 1.0], 2**bits // 2)
 
 
-def _turn(ring: FloatArray) -> int:
-    """-1 where a ring [n, 2] goes clockwise as seen in an image, else 1."""
+def _orientation(ring: FloatArray) -> int:
+    """Return -1 where a ring [n, 2] goes clockwise as seen in an image, else 1."""
     return 1 if cv2.contourArea(ring.astype(np.float32), oriented=True) < 0 else -1
 
 
 _BLOCK = 1024  # edges compared at a time
 
 
-def crossing(rings: Sequence[FloatArray]) -> bool:
-    """Whether two edges cross, of one ring or of two; rings that only touch do not.
+def rings_cross(rings: Sequence[FloatArray]) -> bool:
+    """Return whether two edges cross, of one ring or of two; rings that only touch do not.
 
     Exact for points with one decimal.
     """
@@ -152,17 +153,20 @@ def crossing(rings: Sequence[FloatArray]) -> bool:
     blocks = [points[:, i : i + _BLOCK] for i in range(0, points.shape[1], _BLOCK)]
     for k, block in enumerate(blocks):
         for other in blocks[k:]:
-            parted = _parted(block, other)
-            if np.count_nonzero(parted & (parted if other is block else _parted(other, block)).T):
+            parted = _separates(block, other)
+            if np.count_nonzero(
+                parted & (parted if other is block else _separates(other, block)).T
+            ):
                 return True
     return False
 
 
-def _parted(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> NDArray[np.bool_]:
-    """Whether the lines through edges [2, m] have the ends of others [2, n], x + iy, on different
-    sides: [m, n].
+def _separates(edges: NDArray[np.complex128], others: NDArray[np.complex128]) -> Mask:
+    """Return [m, n]: the lines through edges [2, m] separate the ends of other edges [2, n].
+
+    Points are complex: x + iy.
     """
     start, along = edges[0, :, None], edges[1, :, None] - edges[0, :, None]
     sides = ((others[:, None] - start) * along.conj()).imag
-    parted: NDArray[np.bool_] = sides[0] * sides[1] < 0
+    parted: Mask = sides[0] * sides[1] < 0
     return parted

@@ -1,6 +1,4 @@
-"""Outlines of few vertices: Douglas-Peucker, Visvalingam, bisection on a tolerance, and BAS-DP
-(paper 2.1.3).
-"""
+"""Reduce outlines to few vertices: Douglas-Peucker, Visvalingam, and BAS-DP (paper 2.1.3)."""
 
 from collections.abc import Callable, Sequence
 from heapq import heapify, heappop, heappush
@@ -10,43 +8,45 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from cohdc_train.contour.beetle_search import BeetleSearch, search_vertices
-from cohdc_train.contour.polygon_iou import Coverage
-from cohdc_train.contour.polygons import FloatArray, Polygon, vertices
-from cohdc_train.contour.tolerance_search import Bracket
+from cohdc_train.contour.beetle_parameters import BeetleSearch
+from cohdc_train.contour.beetle_search import search_vertices
+from cohdc_train.contour.polygon_iou import IoUEvaluator
+from cohdc_train.contour.polygons import Polygon, count_vertices
+from cohdc_train.contour.tolerance_search import ToleranceBracket
+from cohdc_train.types import FloatArray
 
-Method = Literal["bisection", "bas_dp", "dp", "visvalingam"]
-METHODS: tuple[Method, ...] = get_args(Method)
+ContourMethod = Literal["bisection", "bas_dp", "dp", "visvalingam"]
+METHODS: tuple[ContourMethod, ...] = get_args(ContourMethod)
 Reduction = Callable[[FloatArray, float], FloatArray]
 
-_EVALUATIONS = 9  # of a tolerance at most; three or four do
-_FINEST, _COARSEST = 0.25, 0.1  # tolerances looked at: px, and a share of the outline's diagonal
+_MAX_EVALUATIONS = 9  # of tolerances; three or four are usual
+_FINEST, _COARSEST = 0.25, 0.1  # tolerances: px, and share of the diagonal
 _FINER = 0.9
-_LOST = 0.175  # area lost per px of tolerance and px of outline, about
+_LOST = 0.175  # area lost per px of tolerance and px of outline, roughly
 
 
 def simplify(
     polygons: Sequence[Polygon],
     iou_floor: float = 0.95,
-    method: Method = "bisection",
+    method: ContourMethod = "bisection",
     epsilon: float = 2.0,
     search: BeetleSearch | None = None,
 ) -> list[Polygon]:
-    """The same outline with fewer vertices.
+    """Return outlines of fewer vertices.
 
-    `bisection` looks for the largest Douglas-Peucker tolerance that keeps the floor: the real-time
-    path. `visvalingam` does so with Visvalingam and Whyatt's triangles. `bas_dp` goes on from
+    `bisection` looks for the largest Douglas-Peucker tolerance that keeps the floor, for real time.
+    `visvalingam` does so with Visvalingam and Whyatt's triangles. `bas_dp` continues from
     bisection: it drops vertices and moves the rest by beetle antennae search (the paper's equation
     2), and keeps the finer polygon when the floor cannot be reached. `dp` is plain Douglas-Peucker
-    with a fixed tolerance, which knows no floor.
+    with a fixed tolerance, without a floor.
 
-    But for `dp`, rings of a result do not cross themselves or each other; where a coarser one
+    Except for `dp`, rings of a result do not cross themselves or each other; where a coarser one
     would, the finer one stays. Small parts and holes vanish where the floor allows it.
 
     Args:
         polygons: as `trace` gives them.
-        iou_floor: least IoU, 0..1, of the result with the polygons given, both filled at pixel
-            centres; not of `dp`.
+        iou_floor: smallest IoU, 0..1, of the result with the polygons given, both filled at pixel
+            centers; not for `dp`.
         method: one of METHODS.
         epsilon: the tolerance of `dp`, px.
         search: parameters of `bas_dp`.
@@ -59,50 +59,54 @@ def simplify(
     if not polygons:
         return []
     if method == "dp":
-        return _each_ring(polygons, _douglas_peucker, epsilon)
-    coverage = Coverage(polygons)
+        return _reduce_rings(polygons, _douglas_peucker, epsilon)
+    evaluator = IoUEvaluator(polygons)
     finer = _bisect(
-        polygons, iou_floor, coverage, _visvalingam if method == "visvalingam" else _douglas_peucker
+        polygons,
+        iou_floor,
+        evaluator,
+        _visvalingam if method == "visvalingam" else _douglas_peucker,
     )
     if method != "bas_dp":
         return finer
-    return search_vertices(finer, iou_floor, coverage, search or BeetleSearch())
+    return search_vertices(finer, iou_floor, evaluator, search or BeetleSearch())
 
 
 def _bisect(
-    polygons: Sequence[Polygon], iou_floor: float, coverage: Coverage, reduce: Reduction
+    polygons: Sequence[Polygon], iou_floor: float, evaluator: IoUEvaluator, reduce: Reduction
 ) -> list[Polygon]:
-    """The result with the fewest vertices among tolerances that keep the floor; the outline itself
-    if none does.
+    """Return the result with the fewest vertices among tolerances that keep the floor.
+
+    It is the outline itself if none does.
     """
     length = sum(
         cv2.arcLength(ring.astype(np.float32), True)
         for polygon in polygons
         for ring in polygon.rings
     )
-    coarsest = max(_COARSEST * hypot(*(coverage.high - coverage.low)), 2 * _FINEST)
-    bracket = Bracket.of(_FINEST, coarsest, 1 - iou_floor, _LOST * length / coverage.area)
+    coarsest = max(_COARSEST * hypot(*(evaluator.high - evaluator.low)), 2 * _FINEST)
+    bracket = ToleranceBracket.of(_FINEST, coarsest, 1 - iou_floor, _LOST * length / evaluator.area)
     kept: list[list[Polygon]] = []
-    for _ in range(_EVALUATIONS):
-        coarser = _each_ring(polygons, reduce, exp(bracket.at))
-        iou = coverage.iou(coarser)
+    for _ in range(_MAX_EVALUATIONS):
+        coarser = _reduce_rings(polygons, reduce, exp(bracket.at))
+        iou = evaluator.iou(coarser)
         if iou >= iou_floor:
             kept.append(coarser)
-        if not bracket.add(1 - iou, vertices(coarser), iou >= iou_floor):
+        if not bracket.add(1 - iou, count_vertices(coarser), iou >= iou_floor):
             break
     # The IoU does not fall evenly, so that a later one may have more vertices.
-    for coarser in sorted(kept, key=vertices):
-        if coverage.valid(coarser):
+    for coarser in sorted(kept, key=count_vertices):
+        if evaluator.is_valid(coarser):
             return coarser
     epsilon = exp(bracket.low.at)
-    while kept and (epsilon := epsilon * _FINER) > _FINEST:  # rings cross: where they do not yet
-        coarser = _each_ring(polygons, reduce, epsilon)
-        if coverage.iou(coarser) >= iou_floor and coverage.valid(coarser):
+    while kept and (epsilon := epsilon * _FINER) > _FINEST:  # rings cross: refine
+        coarser = _reduce_rings(polygons, reduce, epsilon)
+        if evaluator.iou(coarser) >= iou_floor and evaluator.is_valid(coarser):
             return coarser
     return list(polygons)
 
 
-def _each_ring(polygons: Sequence[Polygon], reduce: Reduction, epsilon: float) -> list[Polygon]:
+def _reduce_rings(polygons: Sequence[Polygon], reduce: Reduction, epsilon: float) -> list[Polygon]:
     reduced = []
     for polygon in polygons:
         outer, *holes = (reduce(ring, epsilon) for ring in polygon.rings)
@@ -116,9 +120,7 @@ def _douglas_peucker(ring: FloatArray, epsilon: float) -> FloatArray:
 
 
 def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
-    """Without the vertices whose triangle with their neighbours is smaller than epsilon^2 px,
-    smallest first.
-    """
+    """Drop vertices whose triangle with their neighbors is below epsilon^2, smallest first."""
     area = epsilon**2
     x: list[float] = ring[:, 0].tolist()
     y: list[float] = ring[:, 1].tolist()
@@ -136,7 +138,7 @@ def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
     size = {i: value for value, i in heap}
     while heap and len(size) > 2:
         value, i = heappop(heap)
-        if size.get(i) != value:  # gone, or of another area by now
+        if size.get(i) != value:  # removed, or its area has changed
             continue
         if value >= area:
             break
@@ -144,6 +146,6 @@ def _visvalingam(ring: FloatArray, epsilon: float) -> FloatArray:
         a, b = before[i], after[i]
         after[a], before[b] = b, a
         for j in (a, b):
-            size[j] = max(triangle(j), value)  # never smaller than what went before it
+            size[j] = max(triangle(j), value)  # never smaller than one removed before
             heappush(heap, (size[j], j))
     return ring[sorted(size)] if len(size) > 2 else ring[:0]

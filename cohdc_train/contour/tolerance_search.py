@@ -1,21 +1,24 @@
-"""Where the coarsest tolerance that keeps a floor of IoU lies."""
+"""Find the coarsest tolerance that keeps a floor of the IoU."""
 
 from dataclasses import dataclass, field
 from math import log
 
-_NARROW = 0.06  # of a logarithm: the bracket is not made narrower
-_CLIP = 0.35  # the next tolerance keeps that share of the bracket to either end
-_FIRST_STEP = 0.06  # of a logarithm, as long as one end is not known
-_AIM, _ENOUGH = (
-    0.04,
-    0.08,
-)  # logarithm of what may be lost over what is: aimed at, and good enough to end with
+_MIN_WIDTH = 0.06  # of the bracket, logarithm
+_CLIP = 0.35  # smallest distance of the next tolerance to an end, share of the bracket
+_FIRST_STEP = 0.06  # logarithm, while one end is not known
+_AIM, _ENOUGH = 0.04, 0.08  # logarithm of allowed over actual loss: the aim, and the end
 _LEAST_LOST = 1e-6
 
 
 @dataclass
-class _End:
-    """One end of the bracket: the logarithm of a tolerance, and what is known of its result."""
+class _BracketEnd:
+    """One end of the bracket.
+
+    Attributes:
+        at: logarithm of a tolerance.
+        vertices: number of vertices of its result; None before it was tried.
+        excess: logarithm of what is lost, 1 - IoU, over what may be.
+    """
 
     at: float
     vertices: int | None = None
@@ -23,46 +26,56 @@ class _End:
 
 
 @dataclass
-class Bracket:
+class ToleranceBracket:
     """Two tolerances, of which the finer keeps the floor and the coarser does not.
 
-    What is lost grows about as the tolerance, so that on logarithmic scales a line through what is
-    known tells where the floor is reached. `at` is the logarithm of the tolerance to try, which
-    `add` moves on.
+    The loss grows about as the tolerance, so that on logarithmic scales a line through the known
+    results tells where the floor is reached.
+
+    Attributes:
+        low: the finer end.
+        high: the coarser end.
+        allowed: 1 - the floor.
+        at: logarithm of the next tolerance to try, which `add` changes.
     """
 
-    low: _End
-    high: _End
+    low: _BracketEnd
+    high: _BracketEnd
     allowed: float
     at: float
     _step: float = field(default=_FIRST_STEP, init=False)
 
     @classmethod
-    def of(cls, finest: float, coarsest: float, allowed: float, rise: float) -> "Bracket":
-        """Between two tolerances, px. allowed: 1 - the floor; rise: what is lost per px of
-        tolerance.
+    def of(cls, finest: float, coarsest: float, allowed: float, rise: float) -> "ToleranceBracket":
+        """Return the bracket between two tolerances, px.
+
+        Args:
+            finest: px.
+            coarsest: px.
+            allowed: 1 - the floor.
+            rise: loss per px of tolerance.
         """
         low, high, allowed = log(finest), log(coarsest), max(allowed, _LEAST_LOST)
         return cls(
-            _End(low),
-            _End(high),
+            _BracketEnd(low),
+            _BracketEnd(high),
             allowed,
-            min(max(log(allowed / rise), low + _NARROW), high - _NARROW),
+            min(max(log(allowed / rise), low + _MIN_WIDTH), high - _MIN_WIDTH),
         )
 
     def add(self, lost: float, vertices: int, keeps: bool) -> bool:
-        """What came out at `at`; whether another tolerance is worth a try.
+        """Add the result at `at`, and return whether another tolerance is worth a try.
 
-        It is not when the floor is all but reached, when the bracket is narrow, or when one vertex
-        is all that its ends differ by.
+        It is not when the floor is nearly reached, when the bracket is narrow, or when its ends
+        differ by one vertex only.
         """
-        here = _End(self.at, vertices, log(max(lost, _LEAST_LOST) / self.allowed))
+        here = _BracketEnd(self.at, vertices, log(max(lost, _LEAST_LOST) / self.allowed))
         if keeps:
             self.low = here
         else:
             self.high = here
         low, high = self.low, self.high
-        if (keeps and here.excess > -_ENOUGH) or high.at - low.at < _NARROW:
+        if (keeps and here.excess > -_ENOUGH) or high.at - low.at < _MIN_WIDTH:
             return False
         if low.vertices is None or high.vertices is None:
             step, self._step = max(abs(here.excess + _AIM), self._step), 2 * self._step

@@ -1,6 +1,4 @@
-"""One annotation and one image of a COCO-format file, checked (numpy, pycocotools, OpenCV; no
-torch).
-"""
+"""Check and read one annotation or one image of a COCO-format file (no torch)."""
 
 import math
 import warnings
@@ -16,8 +14,9 @@ from pycocotools import mask as rle
 from cohdc_train.data.image_files import check_size
 from cohdc_train.errors import DataError
 from cohdc_train.images import read_rgb, size_of
+from cohdc_train.types import Image
 
-_FAR = 1e5  # px from which a coordinate is a mistake; pycocotools draws such polygons point by point until memory ends
+_MAX_COORDINATE = 1e5  # px; farther points are mistakes, which pycocotools fills until memory ends
 _CLIP_TOLERANCE = 1.0  # px beyond the edge that is rounding, not a mistake worth counting
 
 
@@ -43,14 +42,12 @@ class CocoObject:
     crowd: bool
 
     def mask(self, height: int, width: int) -> NDArray[np.uint8]:
-        """[height, width] uint8 of 0 and 1; what lies outside the image is cut off."""
+        """Return the mask, [height, width] uint8 of 0 and 1, cut off at the image's border."""
         if isinstance(self.segmentation, dict):
             encoded = self.segmentation
         else:
             encoded = rle.merge(rle.frPyObjects(self.segmentation, height, width))
-        with (
-            warnings.catch_warnings()
-        ):  # pycocotools 2.0.11 decodes under numpy 2 by a deprecated way
+        with warnings.catch_warnings():  # pycocotools 2.0.11 under numpy 2
             warnings.simplefilter("ignore", DeprecationWarning)
             decoded: NDArray[np.uint8] = rle.decode(encoded)
         return decoded
@@ -58,7 +55,7 @@ class CocoObject:
 
 @dataclass(frozen=True)
 class CocoImage:
-    """One image and its objects; an image without objects is kept, it teaches what is background."""
+    """One image and its objects. An image without objects is kept: it shows only background."""
 
     id: int
     path: Path
@@ -67,13 +64,14 @@ class CocoImage:
     objects: tuple[CocoObject, ...]
 
 
-def read_image(image: CocoImage) -> NDArray[np.uint8]:
+def read_image(image: CocoImage) -> Image:
     """Return the image as it was annotated, [height, width, 3] uint8 RGB.
 
-    It is upright, turned by its EXIF orientation, unless the annotated size is that of the stored
-    pixels only.
-    Raises DataError naming file and id when it cannot be decoded or its size is not the annotated
-    one.
+    It is turned by its EXIF orientation, unless the annotated size is that of the stored pixels
+    only.
+
+    Raises:
+        DataError: the image cannot be decoded, or its size is not the annotated one.
     """
     annotated = (image.width, image.height)
     pixels = read_rgb(image.path, annotated)
@@ -84,42 +82,54 @@ def read_image(image: CocoImage) -> NDArray[np.uint8]:
 
 
 def read_segmentation(path: Path, row: dict[str, Any], image: CocoImage) -> Any:
-    """Polygons that can be drawn, with at least three points each, or a compressed RLE; empty when
-    there is none.
+    """Return the polygons that can be drawn, or a compressed RLE; empty when there is none.
+
+    Polygons with fewer than three points or with a coordinate that is no finite number are skipped.
+
+    Args:
+        path: the annotation file, for error messages.
+        row: the annotation.
+        image: the image that it belongs to.
+
+    Raises:
+        DataError: the segmentation is neither polygons nor an RLE of the image's size.
     """
     given = row.get("segmentation") or []
     try:
         if not isinstance(given, dict | list):
             raise TypeError("segmentation")
         if isinstance(given, list):
-            parts = [
-                list(map(float, part)) for part in given if len(part) >= 6 and len(part) % 2 == 0
-            ]
-            return [
-                part for part in parts if all(abs(value) <= _FAR for value in part)
-            ]  # neither NaN nor infinite
+            drawable = [part for part in given if len(part) >= 6 and len(part) % 2 == 0]
+            polygons = [[float(value) for value in part] for part in drawable]
+            return [polygon for polygon in polygons if _is_near_image(polygon)]
         if list(given["size"]) != [image.height, image.width]:
-            size = f"{image.height}x{image.width}"
-            raise DataError(
-                f"{path}: annotation {row.get('id')}: RLE of size {given['size']} for an image of {size}"
-            )
-        if not fills(given["counts"], image.height * image.width):
+            sizes = f"size {given['size']} for an image of {image.height}x{image.width}"
+            raise DataError(f"{path}: annotation {row.get('id')}: RLE of {sizes}")
+        if not fills_image(given["counts"], image.height * image.width):
             raise ValueError("RLE counts")
         if isinstance(given["counts"], list):
             given = rle.frPyObjects(given, image.height, image.width)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: annotation {row.get('id')}: neither polygons nor RLE") from error
-    counts = given["counts"]
-    return {
-        "size": list(given["size"]),
-        "counts": counts.decode() if isinstance(counts, bytes) else counts,
-    }
+    return rle_as_text(given)
 
 
-def fills(counts: str | bytes | list[int], pixels: int) -> bool:
-    """Whether the runs of an RLE, compressed (text) or not, fill so many pixels.
+def _is_near_image(polygon: Sequence[float]) -> bool:
+    """Return whether all coordinates can be drawn; not so for NaN and infinity."""
+    return all(abs(value) <= _MAX_COORDINATE for value in polygon)
 
-    pycocotools decodes a damaged one without a word, into wrong pixels.
+
+def rle_as_text(encoded: dict[str, Any]) -> dict[str, Any]:
+    """Return a compressed RLE whose counts are text, as JSON needs them."""
+    counts = encoded["counts"]
+    text = counts.decode() if isinstance(counts, bytes) else counts
+    return {"size": list(encoded["size"]), "counts": text}
+
+
+def fills_image(counts: str | bytes | list[int], pixels: int) -> bool:
+    """Return whether the runs of an RLE, compressed (text) or not, fill so many pixels.
+
+    pycocotools decodes a damaged RLE into wrong pixels without an error.
     """
     try:
         text = counts.decode() if isinstance(counts, bytes) else counts
@@ -130,11 +140,11 @@ def fills(counts: str | bytes | list[int], pixels: int) -> bool:
 
 
 def _decompressed(text: str) -> list[int]:
-    """The run lengths of COCO's compressed RLE.
+    """Return the run lengths of COCO's compressed RLE.
 
-    Each is written in groups of 5 bits, lowest first, 32 marking that another group follows and the
-    last group's highest bit a negative number; from the fourth on, a number is the difference to
-    the run before the last.
+    Each number is written in groups of 5 bits, lowest first. Bit 32 of a character marks that
+    another group follows; the highest bit of the last group marks a negative number. From the
+    fourth number on, each is the difference to the run before the last.
     """
     runs: list[int] = []
     value, shift = 0, 0
@@ -155,35 +165,39 @@ def _decompressed(text: str) -> list[int]:
     return runs
 
 
-def defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
-    """Why an annotation cannot be used; empty when it can."""
+def find_defect(row: dict[str, Any], segmentation: Any, image: CocoImage) -> str:
+    """Return why an annotation cannot be used; empty when it can."""
     box = row.get("bbox")
-    if box is not None and not (is_numbers(box, 4) and _has_extent(_clip(box, image))):
+    if box is not None and not (is_number_list(box, 4) and _has_extent(_clip_box(box, image))):
         return "degenerate box"
     if not segmentation:
         return "" if is_crowd(row) and box is not None else "no contour"
-    return "" if _has_extent(_clip(_extent(segmentation), image)) else "degenerate contour"
+    return (
+        "" if _has_extent(_clip_box(_bounding_box(segmentation), image)) else "degenerate contour"
+    )
 
 
 def build_object(
     row: dict[str, Any], label: int, segmentation: Any, image: CocoImage
 ) -> CocoObject:
-    """The object of a sound annotation; a missing box is taken from the contour."""
-    box = _clip(row["bbox"] if row.get("bbox") is not None else _extent(segmentation), image)
+    """Return the object of a sound annotation. A missing box is taken from the contour."""
+    box = _clip_box(
+        row["bbox"] if row.get("bbox") is not None else _bounding_box(segmentation), image
+    )
     area, number = row.get("area"), row.get("id")
-    area = float(area) if area and is_numbers([area], 1) else box[2] * box[3]
+    area = float(area) if area and is_number_list([area], 1) else box[2] * box[3]
     return CocoObject(
         number if isinstance(number, int) else 0, label, box, area, segmentation, is_crowd(row)
     )
 
 
 def is_crowd(row: dict[str, Any]) -> bool:
-    """Whether `iscrowd` is 1, as a number, a truth value or text; all else is none."""
+    """Return whether `iscrowd` is 1, given as a number, a truth value or text."""
     return row.get("iscrowd") in (1, "1", "true")
 
 
-def _extent(segmentation: Any) -> tuple[float, float, float, float]:
-    """x, y, width, height of a segmentation."""
+def _bounding_box(segmentation: Any) -> tuple[float, float, float, float]:
+    """Return x, y, width and height of a segmentation, px."""
     if isinstance(segmentation, dict):
         x, y, width, height = (float(v) for v in rle.toBbox(segmentation))
         return x, y, width, height
@@ -192,7 +206,8 @@ def _extent(segmentation: Any) -> tuple[float, float, float, float]:
     return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
-def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, float]:
+def _clip_box(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, float]:
+    """Return x, y, width and height, px, of the part of a box that lies in the image."""
     x0, y0 = max(float(box[0]), 0.0), max(float(box[1]), 0.0)
     x1, y1 = (
         min(float(box[0]) + float(box[2]), image.width),
@@ -201,8 +216,8 @@ def _clip(box: Sequence[float], image: CocoImage) -> tuple[float, float, float, 
     return x0, y0, x1 - x0, y1 - y0
 
 
-def is_numbers(values: Any, count: int) -> bool:
-    """Whether the values are a list of `count` finite numbers."""
+def is_number_list(values: Any, count: int) -> bool:
+    """Return whether the values are a list of `count` finite numbers."""
     listed = isinstance(values, list | tuple) and len(values) == count
     return listed and all(
         isinstance(value, int | float) and math.isfinite(value) for value in values
@@ -213,8 +228,8 @@ def _has_extent(box: Sequence[float]) -> bool:
     return box[2] > 0 and box[3] > 0
 
 
-def lost_parts(row: dict[str, Any], segmentation: Any) -> int:
-    """How many polygons of an annotation `read_segmentation` left out beside those it kept."""
+def broken_polygons(row: dict[str, Any], segmentation: Any) -> int:
+    """Return how many polygons of an annotation `read_segmentation` skipped, if it kept others."""
     return (
         len(row["segmentation"]) - len(segmentation)
         if isinstance(segmentation, list) and segmentation
@@ -222,11 +237,11 @@ def lost_parts(row: dict[str, Any], segmentation: Any) -> int:
     )
 
 
-def reaches_out(box: Sequence[float] | None, image: CocoImage) -> bool:
-    """Whether an annotated box leaves the image by more than the tolerance."""
+def exceeds_image(box: Sequence[float] | None, image: CocoImage) -> bool:
+    """Return whether an annotated box leaves the image by more than the tolerance."""
     if box is None:
         return False
-    inside = _clip(box, image)
+    inside = _clip_box(box, image)
     return max(abs(inside[0] - box[0]), abs(inside[1] - box[1])) > _CLIP_TOLERANCE or (
         max(box[2] - inside[2], box[3] - inside[3]) > _CLIP_TOLERANCE
     )

@@ -1,10 +1,10 @@
-"""Canvas size from the images of a data set (no torch)."""
+"""Choose the canvas size from the images of a data set (no torch)."""
 
 import math
 import statistics
 from collections.abc import Sequence
 
-MAX_AREA_PX = 480 * 640  # what HDC-Net n trains on in minutes on one core
+MAX_AREA_PX = 480 * 640  # HDC-Net n trains on it in minutes on one core
 GRID_PX = 32  # stride of the coarsest level that RoIs are pooled from
 
 

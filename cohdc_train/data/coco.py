@@ -1,7 +1,7 @@
-"""COCO-format annotations -> checked objects with labels 1..C (no torch).
+"""Read COCO-format annotations into checked objects with labels 1..C (no torch).
 
-Numbers of classes are read, never typed: category ids are remapped through `categories`, sorted by
-id, to 1..C.
+The number of classes is read from the file. Category ids are remapped through `categories`, sorted
+by id, to 1..C.
 """
 
 from collections import Counter
@@ -15,10 +15,10 @@ import numpy as np
 from cohdc_train.data.annotations import (
     CocoImage,
     CocoObject,
+    broken_polygons,
     build_object,
-    defect,
-    lost_parts,
-    reaches_out,
+    exceeds_image,
+    find_defect,
     read_segmentation,
 )
 from cohdc_train.data.layout import CocoPaths, SplitPaths, find_split, read_json
@@ -31,12 +31,12 @@ class CocoSplit:
 
     Attributes:
         name: "train" or "val".
-        annotations: the file it was read from.
+        annotations: the file that it was read from.
         class_names: name of label i + 1 at index i.
         images: sorted by id.
-        dropped: number of annotations left out, by reason.
+        dropped: number of annotations that were skipped, by reason.
         clipped: number of annotations that reached more than 1 px out of their image.
-        lost_parts: number of polygons left out of contours that have others.
+        broken_polygons: number of polygons skipped from contours that have others.
     """
 
     name: str
@@ -45,11 +45,13 @@ class CocoSplit:
     images: tuple[CocoImage, ...]
     dropped: dict[str, int] = field(default_factory=dict)
     clipped: int = 0
-    lost_parts: int = 0
+    broken_polygons: int = 0
 
-    def relabelled(self, class_names: Sequence[str]) -> "CocoSplit":
-        """The same split under another order of the same names. Raises DataError when the names
-        differ.
+    def with_class_order(self, class_names: Sequence[str]) -> "CocoSplit":
+        """Return the split with labels in another order of the same class names.
+
+        Raises:
+            DataError: the names differ.
         """
         if tuple(class_names) == self.class_names:
             return self
@@ -58,51 +60,77 @@ class CocoSplit:
             raise DataError(
                 f"{self.annotations}: classes are {ours}; the training split's are {theirs}"
             )
-        to = [class_names.index(name) + 1 for name in self.class_names]
-        images = tuple(
-            replace(image, objects=tuple(replace(o, label=to[o.label - 1]) for o in image.objects))
-            for image in self.images
-        )
-        return replace(self, class_names=tuple(class_names), images=images)
+        labels = {
+            label: class_names.index(name) + 1 for label, name in enumerate(self.class_names, 1)
+        }
+        return self._relabeled(class_names, labels)
+
+    def with_classes(self, class_names: Sequence[str]) -> "CocoSplit":
+        """Return the split with the objects of some of its classes only.
+
+        Raises:
+            DataError: no object is left.
+        """
+        kept = [name for name in self.class_names if name in class_names]
+        labels = {self.class_names.index(name) + 1: kept.index(name) + 1 for name in kept}
+        split = self._relabeled(kept, labels)
+        split.check_objects()
+        return split
+
+    def _relabeled(self, class_names: Sequence[str], labels: dict[int, int]) -> "CocoSplit":
+        """Return the split with new labels, without objects whose label has no new one."""
+        images = []
+        for image in self.images:
+            kept = [o for o in image.objects if o.label in labels]
+            objects = tuple(replace(o, label=labels[o.label]) for o in kept)
+            images.append(replace(image, objects=objects))
+        return replace(self, class_names=tuple(class_names), images=tuple(images))
+
+    def check_objects(self) -> None:
+        """Raise DataError when there is no object to learn or to score."""
+        if not self.without_empty_images().images:
+            why = dict(self.dropped) or "no annotation of these classes"
+            raise DataError(f"{self.annotations}: no object to learn: {why}")
 
     def subset(self, count: int | None) -> "CocoSplit":
-        """`count` images drawn at random, always the same ones; a larger subset holds the smaller.
-        None keeps all.
+        """Return the split with `count` images, drawn at random but always the same; None for all.
 
-        Raises DataError when there are fewer.
+        A larger subset contains the smaller.
+
+        Raises:
+            DataError: the split has fewer images.
         """
         if count is None:
             return self
         if not 0 < count <= len(self.images):
-            raise DataError(
-                f"{self.annotations}: {count} {self.name} images asked for, {len(self.images)} there"
-            )
+            wanted = f"{count} {self.name} images asked for, {len(self.images)} there"
+            raise DataError(f"{self.annotations}: {wanted}")
         chosen = sorted(np.random.default_rng(0).permutation(len(self.images))[:count])
         return replace(self, images=tuple(self.images[i] for i in chosen))
 
-    def with_objects(self) -> "CocoSplit":
+    def without_empty_images(self) -> "CocoSplit":
         """Return the split without images that have no object."""
         return replace(
             self,
             images=tuple(image for image in self.images if any(not o.crowd for o in image.objects)),
         )
 
-    def losses(self) -> str:
-        """What reading left out or cut, counted, in one line; empty when nothing was."""
+    def reading_report(self) -> str:
+        """Return one line that counts what reading skipped or clipped; empty when nothing was."""
         parts = [
             f"{number} annotations dropped ({reason})"
             for reason, number in sorted(self.dropped.items())
         ]
         parts += [f"{self.clipped} clipped to the image"] if self.clipped else []
         parts += (
-            [f"{self.lost_parts} broken polygons left out of contours"] if self.lost_parts else []
+            [f"{self.broken_polygons} broken polygons skipped in contours"]
+            if self.broken_polygons
+            else []
         )
         return f"{self.annotations}: {', '.join(parts)}" if parts else ""
 
     def ground_truth(self) -> dict[str, Any]:
-        """The split as a COCO dict of its kept objects, category ids 1..C: what the scores are
-        measured against.
-        """
+        """Return the kept objects as a COCO dict with category ids 1..C, for the scores."""
         categories = [{"id": i + 1, "name": name} for i, name in enumerate(self.class_names)]
         images = [
             {"id": image.id, "height": image.height, "width": image.width} for image in self.images
@@ -125,7 +153,7 @@ class CocoSplit:
 
 @dataclass(frozen=True)
 class CocoFolder:
-    """Training splits (one per root) and the first root's validation split, under one class map."""
+    """Training splits, one per root, and the first root's validation split, of the same classes."""
 
     train: tuple[CocoSplit, ...]
     val: CocoSplit
@@ -139,17 +167,24 @@ class CocoFolder:
 def read_folder(
     roots: Sequence[Path], classes: Sequence[str] | None = None, paths: CocoPaths | None = None
 ) -> CocoFolder:
-    """Training and validation data of one or several folders.
+    """Read the training and validation data of one or several folders.
 
-    The class map is the first training split's; the other splits must have the same names after the
-    filter, whatever their ids. `paths` overrides the first root's places, or stands alone.
-    Raises DataError in one line naming file and id.
+    The class labels are those of the first training split. The other splits must have the same
+    names after the filter; their ids may differ.
+
+    Args:
+        roots: the folders.
+        classes: keep these classes only; None keeps all.
+        paths: places of the first root's files, where its layout is an unusual one, or instead of
+            it.
+
+    Raises:
+        DataError: a file cannot be used; one line names the file and the id.
     """
     paths = paths or CocoPaths()
     if not roots and (paths.train_json is None or paths.val_json is None):
-        raise DataError(
-            "no data: give a folder (cohdc fit DATA) or data.paths: train_json, train_images, val_json and val_images"
-        )
+        needed = "train_json, train_images, val_json and val_images"
+        raise DataError(f"no data: give a folder (cohdc fit DATA) or data.paths: {needed}")
     found = [
         paths.split("train") or find_split(roots[0], "train"),
         *(find_split(r, "train") for r in roots[1:]),
@@ -157,7 +192,9 @@ def read_folder(
     train = [read_split("train", files, classes) for files in found]
     names = train[0].class_names
     val = read_split("val", paths.split("val") or find_split(roots[0], "val"), classes)
-    return CocoFolder(tuple(split.relabelled(names) for split in train), val.relabelled(names))
+    return CocoFolder(
+        tuple(split.with_class_order(names) for split in train), val.with_class_order(names)
+    )
 
 
 def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = None) -> CocoSplit:
@@ -165,11 +202,20 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
 
     Segmentations may be polygons, compressed or uncompressed RLE. Objects whose box or contour has
     no extent inside the image are dropped and counted, and so are boxes without a contour.
-    Raises DataError naming the file and the image, annotation or class that cannot be used.
+
+    Args:
+        name: "train" or "val".
+        files: the annotation file and the folder of its images.
+        classes: keep these classes only; None keeps all.
+
+    Raises:
+        DataError: an image, an annotation or a class cannot be used; one line names it and the
+            file.
     """
     content = read_json(files.annotations)
     names, labels = _class_map(files.annotations, content["categories"], classes)
-    images = {image.id: image for image in (_read_image(files, row) for row in content["images"])}
+    listed = [_read_image(files, row) for row in content["images"]]
+    images = {image.id: image for image in listed}
     if len(images) != len(content["images"]):
         raise DataError(
             f"{files.annotations}: {len(content['images']) - len(images)} image ids are used twice"
@@ -182,25 +228,23 @@ def read_split(name: str, files: SplitPaths, classes: Sequence[str] | None = Non
         if label == 0:
             continue
         segmentation = read_segmentation(files.annotations, row, image)
-        reason = defect(row, segmentation, image)
+        reason = find_defect(row, segmentation, image)
         if reason:
             dropped[reason] += 1
             continue
-        lost += lost_parts(row, segmentation)
-        clipped += reaches_out(row.get("bbox"), image)
+        lost += broken_polygons(row, segmentation)
+        clipped += exceeds_image(row.get("bbox"), image)
         objects[image.id].append(build_object(row, label, segmentation, image))
     kept = tuple(replace(images[i], objects=tuple(objects[i])) for i in sorted(images))
-    if not any(o for image in kept for o in image.objects if not o.crowd):
-        raise DataError(
-            f"{files.annotations}: no object to learn: {dict(dropped) or 'no annotation of these classes'}"
-        )
-    return CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
+    split = CocoSplit(name, files.annotations, names, kept, dict(dropped), clipped, lost)
+    split.check_objects()
+    return split
 
 
 def _class_map(
     path: Path, categories: list[dict[str, Any]], classes: Sequence[str] | None
 ) -> tuple[tuple[str, ...], dict[int, int]]:
-    """Class names in label order, and category id -> label (0: filtered away)."""
+    """Return class names in label order, and category id -> label (0: not in `classes`)."""
     try:
         known = dict(sorted((int(row["id"]), str(row["name"])) for row in categories))
     except (KeyError, TypeError, ValueError) as error:
@@ -232,7 +276,7 @@ def _read_image(files: SplitPaths, row: dict[str, Any]) -> CocoImage:
 def _references(
     path: Path, row: Any, images: dict[int, CocoImage], labels: dict[int, int]
 ) -> tuple[CocoImage, int]:
-    """The image and the label an annotation points at."""
+    """Return the image and the label that an annotation refers to."""
     if not isinstance(row, dict):
         raise DataError(
             f"{path}: annotation {row!r:.40}: needs id, image_id, category_id and segmentation"

@@ -1,4 +1,4 @@
-"""The verbs of `cohdc data` (no torch)."""
+"""Verbs of `cohdc data` (no torch)."""
 
 from cohdc_train.data.convert import convert
 from cohdc_train.data.doctor.doctor import doctor, stats

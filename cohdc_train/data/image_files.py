@@ -1,12 +1,9 @@
-"""Image files before training: can they be read, how large are they, do two show the same (Pillow,
-no torch).
-"""
+"""Check image files before training: readable, of which size, alike (Pillow, no torch)."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from cohdc_train.errors import DataError
@@ -19,8 +16,9 @@ from cohdc_train.images import (
     turn_upright,
     upright_size,
 )
+from cohdc_train.types import Float32Array
 
-_TAIL = 4096  # bytes at a file's end in which its end mark is looked for
+_TAIL = 4096  # bytes at the end of a file that are searched for its end mark
 _END_MARKS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 _PLAIN_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 _SIDE = 16  # px, of a fingerprint
@@ -32,25 +30,30 @@ PROBLEMS = {
 
 
 class ImageFile(NamedTuple):
-    """What a file says of itself.
+    """Size, orientation and condition of an image file.
 
-    stored: width and height in px, before any turning by EXIF; 0 when it cannot be read.
-    orientation: EXIF's, 1..8; 1 is upright.
-    plain: 8-bit grey, palette or RGB. problem: "", "missing", "corrupt" or "truncated".
+    Attributes:
+        stored: (width, height), px, before EXIF turns it; 0 when it cannot be read.
+        orientation: EXIF's, 1..8; 1 is upright.
+        is_8bit: 8-bit gray, palette or RGB.
+        problem: "", "missing", "corrupt" or "truncated".
     """
 
     stored: Size = (0, 0)
     orientation: int = 1
-    plain: bool = True
+    is_8bit: bool = True
     problem: str = ""
 
     @property
     def upright(self) -> Size:
-        """Width and height in px of the image as viewers show it."""
+        """Width and height, px, of the image as viewers show it."""
         return upright_size(self.stored, self.orientation)
 
     def is_turned(self, annotated: Size | None) -> bool:
-        """Whether EXIF turns or mirrors the image when it is read for an annotation of a size."""
+        """Return whether EXIF turns or mirrors the image when it is read for an annotation.
+
+        annotated: (width, height) of the annotation, px; None when it is not known.
+        """
         as_stored = is_read_as_stored(self.stored, self.orientation, annotated)
         return self.orientation > 1 and not as_stored
 
@@ -59,8 +62,8 @@ class ImageFile(NamedTuple):
         return self.upright if self.is_turned(annotated) else self.stored
 
 
-def look(path: Path, decode: bool = False) -> ImageFile:
-    """Read a file's header and end; with `decode` all of it, which finds damage in between too."""
+def read_image_file(path: Path, decode: bool = False) -> ImageFile:
+    """Read a file's header and end; with `decode`, all of it, which finds any damage."""
     if not path.is_file():
         return ImageFile(problem="missing")
     try:
@@ -77,16 +80,16 @@ def look(path: Path, decode: bool = False) -> ImageFile:
     return facts
 
 
-def check(path: Path, image_id: int, size: Size) -> None:
-    """Raise DataError naming file and id unless it can be read at the annotated size."""
-    file = look(path)
+def check_image(path: Path, image_id: int, size: Size) -> None:
+    """Raise DataError naming file and id unless the image can be read at the annotated size."""
+    file = read_image_file(path)
     if file.problem:
         raise DataError(f"{path}: image {image_id} {PROBLEMS[file.problem]}")
     check_size(path, image_id, file.size_for(size), size)
 
 
 def check_size(path: Path, image_id: int, found: Size, annotated: Size) -> None:
-    """Raise DataError naming file and id when the two sizes (width, height), px, differ."""
+    """Raise DataError naming file and id when two sizes (width, height), px, differ."""
     if found != annotated:
         swapped = found == annotated[::-1]
         turned = ": swapped, or the file lost its EXIF orientation?" if swapped else ""
@@ -94,10 +97,10 @@ def check_size(path: Path, image_id: int, found: Size, annotated: Size) -> None:
         raise DataError(f"{path}: image {image_id} is {sizes}{turned}")
 
 
-def fingerprint(path: Path) -> NDArray[np.float32]:
-    """Return [256] grey values of the upright image at 16x16, of mean 0 and norm 1.
+def fingerprint(path: Path) -> Float32Array:
+    """Return [256] gray values of the upright image at 16x16, of mean 0 and norm 1.
 
-    The product of two compares the images. All values are 0 for an image of one grey.
+    The product of two compares the images. All values are 0 for an image of one gray level.
     """
     with Image.open(path) as image:
         orientation = orientation_of(image)
@@ -108,15 +111,13 @@ def fingerprint(path: Path) -> NDArray[np.float32]:
     return values / max(float(np.linalg.norm(values)), 1e-6)
 
 
-def mirrored(prints: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fingerprints [N, 256] of the same pictures, flipped left to right."""
+def mirror_fingerprints(prints: Float32Array) -> Float32Array:
+    """Return the fingerprints [N, 256] of the same images, flipped left to right."""
     return prints.reshape(-1, _SIDE, _SIDE)[:, :, ::-1].reshape(-1, _SIDE * _SIDE)
 
 
 def _has_end(path: Path, kind: str | None) -> bool:
-    """Whether the format's end mark stands at the file's end; False when the format has none we
-    know.
-    """
+    """Return whether the end mark of the format ends the file; False for other formats."""
     mark = _END_MARKS.get(kind or "")
     if mark is None:
         return False

@@ -1,4 +1,4 @@
-"""Where a COCO-format folder keeps its annotations and images (no torch)."""
+"""Find the annotations and images of a COCO-format folder (no torch)."""
 
 import json
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ _ALIASES = {"train": ("train",), "val": ("val", "valid")}
 
 @dataclass(frozen=True)
 class SplitPaths:
-    """One split on disk: its annotation file and the folder that `file_name` is relative to."""
+    """Annotation file of a split, and the folder that `file_name` is relative to."""
 
     annotations: Path
     images: Path
@@ -21,7 +21,7 @@ class SplitPaths:
 
 @dataclass(frozen=True)
 class CocoPaths:
-    """Explicit places, for folders of an unusual layout; a split's two paths go together.
+    """Places of files, for folders of an unusual layout. The two paths of a split go together.
 
     Attributes:
         train_json: annotation file of the training split.
@@ -36,8 +36,10 @@ class CocoPaths:
     val_images: Path | None = None
 
     def split(self, name: str) -> SplitPaths | None:
-        """The named split's paths, or None when neither is given. Raises DataError when only one of
-        the two is.
+        """Return the paths of a split, or None when neither is given.
+
+        Raises:
+            DataError: only one of the two is given.
         """
         annotations: Path | None = getattr(self, f"{name}_json")
         images: Path | None = getattr(self, f"{name}_images")
@@ -51,17 +53,21 @@ class CocoPaths:
 
 
 def find_split(root: Path, name: str) -> SplitPaths:
-    """The paths of split `name` ("train" or "val") below `root`, in whichever usual layout it has.
+    """Find the paths of split `name` ("train" or "val") below `root`, in any of the usual layouts.
 
     `images/` + `instances_train.json`; `annotations/instances_train2017.json` + `train2017/`;
-    `train/_annotations.coco.json` beside its images (Roboflow; `valid` counts as `val`).
-    Raises DataError naming the folder when there is none.
+    `train/_annotations.coco.json` with its images in the same folder (Roboflow; `valid` counts as
+    `val`).
+
+    Raises:
+        DataError: there is none; the message names the folder.
     """
     if not root.is_dir():
         raise DataError(f"{root}: no such folder")
     annotations = next((path for path in _annotation_places(root, name) if path.is_file()), None)
     if annotations is None:
-        looked = f"instances_{name}.json, annotations/instances_{name}2017.json, {name}/_annotations.coco.json"
+        looked = f"instances_{name}.json, annotations/instances_{name}2017.json"
+        looked += f", {name}/_annotations.coco.json"
         raise DataError(f"{root}: no annotations of split {name!r}; looked for {looked}")
     if annotations.name == "_annotations.coco.json":
         return SplitPaths(annotations, annotations.parent)
@@ -73,8 +79,10 @@ def find_split(root: Path, name: str) -> SplitPaths:
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file. Raises DataError naming the file when it is missing or no JSON
-    (with the line).
+    """Return the content of a JSON file.
+
+    Raises:
+        DataError: the file is missing or no JSON; the message names the file and the line.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -87,10 +95,10 @@ def load_json(path: Path) -> Any:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """An annotation file as a dict with lists `images`, `annotations` and `categories`.
+    """Return an annotation file as a dict with lists `images`, `annotations` and `categories`.
 
-    Raises DataError naming the file when it is missing, is no JSON (with the line), or lacks one of
-    the lists.
+    Raises:
+        DataError: the file is missing, is no JSON, or lacks one of the lists.
     """
     content = load_json(path)
     for key in ("images", "annotations", "categories"):
@@ -118,7 +126,7 @@ def _image_places(root: Path, name: str) -> Iterator[Path]:
 
 
 def _holds_images(folder: Path, annotations: Path) -> bool:
-    """Whether the first listed image lies in the folder."""
+    """Return whether the first listed image lies in the folder."""
     if not folder.is_dir():
         return False
     images = read_json(annotations)["images"]

@@ -1,4 +1,4 @@
-"""Training geometry on the CPU (torchvision.transforms.v2) and photometry on the device (kornia)."""
+"""Geometry of training images on the CPU (torchvision), and photometry on the device (kornia)."""
 
 from dataclasses import dataclass
 
@@ -23,14 +23,14 @@ from torchvision.transforms.v2 import functional as F2  # noqa: N812
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What training images go through.
+    """Augmentation of training images.
 
     Attributes:
         flip: probability of a horizontal flip.
         scale_jitter: smallest and largest scale, relative to the one at which the image just fits
             into the canvas; drawn per image, it is the multi-scale training.
         copy_paste: probability that objects of another training image are pasted over this one.
-        photometric: vary brightness, contrast, colour temperature, noise and blur on the device.
+        photometric: vary brightness, contrast, color temperature, noise and blur on the device.
         degrade: probability of each fault that a moving camera's image has: gamma, light that
             changes across it (a rolling shutter's exposure), motion blur, noise and JPEG.
     """
@@ -42,6 +42,7 @@ class Augmentation:
     degrade: float = 0.0
 
     def __post_init__(self) -> None:
+        """Raise ValueError for a value that is out of range."""
         low, high = self.scale_jitter
         if not 0 < low <= high:
             raise ValueError(f"scale_jitter {self.scale_jitter}: needs 0 < smallest <= largest")
@@ -52,16 +53,15 @@ class Augmentation:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where an image lands on the canvas: a window of it, scaled into the top left, perhaps
-    mirrored; zeros elsewhere.
+    """Place of an image on the canvas: a window of it, scaled into the top left, perhaps mirrored.
 
     The window is cut before it is resized, so that no pixel is computed that would be thrown away.
-    Images are resized bilinearly with antialiasing; masks take the nearest pixel, centre to centre
-    (v2's own rule for masks is half a pixel off).
+    Images are resized bilinearly with antialiasing. Masks take the nearest pixel, center to center
+    (v2's own rule for masks is half a pixel off). The rest of the canvas is 0.
 
     Attributes:
-        top: first row of the window, image px, and so on.
-        left: first column.
+        top: first row of the window, px of the image.
+        left: its first column, px of the image.
         height: rows of the window.
         width: columns of the window.
         size: (height, width) in px of the content on the canvas.
@@ -81,37 +81,40 @@ class Placement:
     def draw(
         cls, image: tuple[int, int], canvas: tuple[int, int], augment: Augmentation
     ) -> "Placement":
-        """A random one for an image of (height, width) px."""
+        """Draw a random placement.
+
+        Args:
+            image: (height, width), px.
+            canvas: (height, width), px.
+            augment: scales and probability of a flip.
+        """
         jitter = float(torch.empty(()).uniform_(*augment.scale_jitter))
-        scale = min(c / n for n, c in zip(image, canvas, strict=True)) * jitter
-        rows, columns = (
-            max(1, min(n, round(c / scale))) for n, c in zip(image, canvas, strict=True)
-        )
-        size = [
-            max(1, min(c, round(n * scale))) for n, c in zip((rows, columns), canvas, strict=True)
-        ]
-        top, left = (
-            int(torch.randint(image[0] - rows + 1, ())),
-            int(torch.randint(image[1] - columns + 1, ())),
-        )
+        scale = min(canvas[0] / image[0], canvas[1] / image[1]) * jitter
+        rows = _round_within(canvas[0] / scale, image[0])
+        columns = _round_within(canvas[1] / scale, image[1])
+        height = _round_within(rows * scale, canvas[0])
+        width = _round_within(columns * scale, canvas[1])
+        top = int(torch.randint(image[0] - rows + 1, ()))
+        left = int(torch.randint(image[1] - columns + 1, ()))
         mirrored = bool(torch.rand(()) < augment.flip)
-        return cls(top, left, rows, columns, (size[0], size[1]), canvas, mirrored)
+        return cls(top, left, rows, columns, (height, width), canvas, mirrored)
 
     def image(self, pixels: Tensor) -> Tensor:
-        """uint8 [3, H, W] -> uint8 [3, *canvas]."""
+        """Place an image: uint8 [3, H, W] -> uint8 [3, *canvas]."""
         window = (self.top, self.left, self.height, self.width)
         return self._finish(F2.resized_crop(pixels, *window, list(self.size), antialias=True))
 
     def mask(self, mask: Tensor) -> Tensor:
-        """uint8 [H, W] of 0 and 1 -> [*canvas]."""
+        """Place a mask of 0 and 1: uint8 [H, W] -> [*canvas]."""
         window = mask[self.top : self.top + self.height, self.left : self.left + self.width]
         return self._finish(
             F.interpolate(window[None, None], self.size, mode="nearest-exact")[0, 0]
         )
 
     def boxes(self, boxes: Tensor) -> Tensor:
-        """float32 [n, 4] xyxy, px -> the same on the canvas, clipped to the content; those outside
-        have no extent.
+        """Place boxes, clipped to the content: float32 [n, 4] xyxy, px -> px of the canvas.
+
+        Boxes outside the content have no extent.
         """
         image_size = (self.top + self.height, self.left + self.width)
         moved = tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=image_size)
@@ -127,9 +130,15 @@ class Placement:
         return F.pad(flipped, (0, self.canvas[1] - self.size[1], 0, self.canvas[0] - self.size[0]))
 
 
+def _round_within(value: float, largest: int) -> int:
+    """Return the nearest whole number in 1..largest."""
+    return max(1, min(largest, round(value)))
+
+
 def mask_boxes(masks: Tensor) -> Tensor:
-    """Tight boxes of masks: [n, H, W] -> float32 [n, 4] xyxy, px, x1 and y1 one past the last
-    pixel; 0 where empty.
+    """Return the tight boxes of masks [n, H, W]: float32 [n, 4] xyxy, px; 0 where one is empty.
+
+    x1 and y1 are one past the last pixel.
     """
     columns, rows = masks.amax(dim=1) > 0, masks.amax(dim=2) > 0
     edges = []
@@ -142,11 +151,10 @@ def mask_boxes(masks: Tensor) -> Tensor:
 
 
 def photometric_augmentation(augment: Augmentation) -> AugmentationSequential | None:
-    """Colour, noise, blur and a camera's faults for float images [B, 3, H, W] in 0..1, drawn per
-    image; None for none.
+    """Return the augmentation of color and of a camera's faults, drawn per image; None for none.
 
-    Colour varies by the temperature of the light: hue and saturation, through HSV, cost five times
-    as much as the rest.
+    It takes float images [B, 3, H, W] in 0..1. Color varies by the temperature of the light: hue
+    and saturation, through HSV, cost five times as much as the rest.
     """
     steps: list[IntensityAugmentationBase2D] = []
     if augment.photometric:
@@ -169,9 +177,7 @@ def photometric_augmentation(augment: Augmentation) -> AugmentationSequential | 
 
 
 def blank_padding(images: Tensor, sizes: list[tuple[int, int]]) -> Tensor:
-    """Images [B, 3, H, W] with zeros, in place, outside the (height, width) that each image's
-    content takes.
-    """
+    """Set images [B, 3, H, W] to 0, in place, outside the (height, width) of their content."""
     for image, (height, width) in zip(images, sizes, strict=True):
         image[:, height:] = 0
         image[:, :, width:] = 0

@@ -1,4 +1,4 @@
-"""`cohdc data tum`: a sequence of the TUM RGB-D benchmark, from its publisher or from an archive."""
+"""Fetch a sequence of the TUM RGB-D benchmark: `cohdc data tum`."""
 
 import gzip
 import os
@@ -51,20 +51,22 @@ def tum(
     digest: str | None = None,
     host: str = HOST,
 ) -> Path:
-    """Fetch a sequence of the TUM RGB-D benchmark, check it, and unpack it into
-    OUT/rgbd_dataset_NAME.
+    """Fetch a sequence of the TUM RGB-D benchmark, check it, and unpack it.
 
-    A download that was cut off goes on where it stopped. Every image that rgb.txt and depth.txt
-    list has to be there, or no folder is left. Returns the folder; one that is there already is
-    checked and kept.
+    It goes into OUT/rgbd_dataset_NAME. A download that was interrupted continues where it stopped.
+    Every image that rgb.txt and depth.txt list has to be there, or no folder is left. A folder that
+    is there already is checked and kept.
 
     Args:
         name: such as walking_xyz, freiburg3_walking_xyz or rgbd_dataset_freiburg3_walking_xyz.
         out: folder for the archive and the sequence.
         archive: the .tgz, fetched by hand.
-        digest: SHA-256 that the archive must have. The publisher gives none; what was read is
-            printed.
-        host: where the folders freiburg1 to freiburg3 lie.
+        digest: SHA-256 that the archive must have. The publisher gives none; the digest that was
+            read is printed.
+        host: address of the folders freiburg1 to freiburg3.
+
+    Returns:
+        The folder of the sequence.
 
     Raises:
         DataError: there is no such sequence, the publisher cannot be reached, or the archive is
@@ -73,7 +75,7 @@ def tum(
     sequence = _sequence(name)
     folder = out / f"{_PREFIX}{sequence}"
     if folder.is_dir():
-        print(f"{folder}: {_check(folder)} images, already there")
+        print(f"{folder}: {_check_complete(folder)} images, already there")
         return folder
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: is not a folder")
@@ -89,13 +91,13 @@ def tum(
             raise DataError(f"{file}: SHA-256 {found}, expected {digest.lower()}")
         with new_folder(folder) as draft:
             _unpack(file, folder.name, draft)
-            count = _check(draft, file)
+            count = _check_complete(draft, file)
     except DataError as error:
         if archive is not None:
             raise
-        if not is_new:  # it may have been fetched by hand
+        if not is_new:  # the user may have fetched it
             raise DataError(f"{error}; delete it to fetch it again") from error
-        fetched.unlink(missing_ok=True)  # so that the next call fetches it again
+        fetched.unlink(missing_ok=True)  # the next call fetches it again
         raise DataError(f"{error}; it was deleted") from error
     print(f"{folder}: {count} images, SHA-256 of the archive {found}")
     return folder
@@ -115,48 +117,49 @@ def _sequence(name: str) -> str:
 
 
 def _download(url: str, file: Path) -> None:
-    """To FILE.part, from its end on where there is one, renamed when it is whole."""
+    """Download into FILE.part, continue a part that is there, and rename it when it is complete."""
     part = file.with_name(file.name + ".part")
-    have = part.stat().st_size if part.is_file() else 0
+    num_bytes = part.stat().st_size if part.is_file() else 0
     try:
-        request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            if have and answer.status != 206:  # the host gives the whole file again
-                have = 0
-            length = answer.headers.get("Content-Length")
-            total = None if length is None else have + int(length)
-            with part.open("ab" if have else "wb") as stream:
-                _copy(answer, stream, have, total)
+        request = urllib.request.Request(
+            url, headers={"Range": f"bytes={num_bytes}-"} if num_bytes else {}
+        )
+        with urllib.request.urlopen(request, timeout=60) as response:
+            if num_bytes and response.status != 206:  # the host sends the whole file again
+                num_bytes = 0
+            length = response.headers.get("Content-Length")
+            total = None if length is None else num_bytes + int(length)
+            with part.open("ab" if num_bytes else "wb") as stream:
+                _copy(response, stream, num_bytes, total)
     except (OSError, HTTPException, ValueError) as error:
-        if (
-            getattr(error, "code", None) == 416
-        ):  # more than all of it is there: of another file, or not renamed
+        if getattr(error, "code", None) == 416:  # the part is larger than the file
             part.unlink()
             return _download(url, file)
         reason = getattr(error, "reason", None) or error
-        raise DataError(
-            f"{url}: cannot be fetched: {reason}; fetch it by hand and give --archive FILE, or try again to go on"
-        ) from error
+        fix = "fetch it by hand and give --archive FILE, or try again to continue"
+        raise DataError(f"{url}: cannot be fetched: {reason}; {fix}") from error
     size = part.stat().st_size
     if total is not None and size != total:
-        raise DataError(f"{part}: {size} of {total} bytes arrived; try again to go on")
+        raise DataError(f"{part}: {size} of {total} bytes arrived; try again to continue")
     os.replace(part, file)
     return None
 
 
-def _copy(answer: Any, stream: Any, done: int, total: int | None) -> None:
-    told = 0
-    while chunk := answer.read(_CHUNK):
+def _copy(response: Any, stream: Any, done: int, total: int | None) -> None:
+    printed_tenths = 0
+    while chunk := response.read(_CHUNK):
         stream.write(chunk)
         done += len(chunk)
-        if total and 10 * done // total > told:
-            told = 10 * done // total
-            print(f"{10 * told} % of {total / 1e6:.0f} MB", flush=True)
+        if total and 10 * done // total > printed_tenths:
+            printed_tenths = 10 * done // total
+            print(f"{10 * printed_tenths} % of {total / 1e6:.0f} MB", flush=True)
 
 
 def _unpack(file: Path, inside: str, target: Path) -> None:
-    """Regular files below the folder `inside` of an archive; nothing that leads out of the target,
-    and no links.
+    """Unpack regular files below the folder `inside` of an archive.
+
+    Raises:
+        DataError: the archive is damaged, or an entry is a link or leads out of the target.
     """
     try:
         with tarfile.open(file, "r:gz") as tar:
@@ -172,7 +175,8 @@ def _unpack(file: Path, inside: str, target: Path) -> None:
                 place = target.joinpath(*parts[1:])
                 place.parent.mkdir(parents=True, exist_ok=True)
                 source = tar.extractfile(member)
-                assert source is not None  # of a regular file
+                if source is None:
+                    raise DataError(f"{file}: entry {member.name!r} has no content")
                 with source, place.open("wb") as stream:
                     while chunk := source.read(_CHUNK):
                         stream.write(chunk)
@@ -184,9 +188,11 @@ def _unpack(file: Path, inside: str, target: Path) -> None:
         ) from error
 
 
-def _check(folder: Path, named: Path | None = None) -> int:
-    """How many images the lists name, all of them there. Raises DataError naming the first thing
-    that is missing.
+def _check_complete(folder: Path, named: Path | None = None) -> int:
+    """Return the number of images that the lists name.
+
+    Raises:
+        DataError: a file is missing; the message names it.
     """
     count = 0
     for name in (*_LISTS, "groundtruth.txt"):

@@ -1,1 +1,1 @@
-"""Checkpoint to ONNX, float32 and int8, each proven before it gets its name."""
+"""Checkpoint to ONNX, float32 and int8, each compared with the network before it is kept."""

@@ -1,4 +1,4 @@
-"""A network -> an ONNX file with the contract's names and metadata, slimmed."""
+"""ONNX graph of a network, with the names and metadata of the contract, slimmed."""
 
 import json
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from cohdc_train.models import Detector, MaskRCNN
 
 OPSET = 18
 MASK_THRESHOLD = 0.5
-_PER_DETECTION = (
-    "roi_heads.mask_head",
-    "roi_heads.mask_predictor",
-    "cqe",
-)  # modules that see detections only
+# Modules that run on detections only.
+_PER_DETECTION = ("roi_heads.mask_head", "roi_heads.mask_predictor", "cqe")
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a network computes: GFLOPs (a multiplication and an addition are two) of one image, and
-    of each detection's mask and quality besides.
+    """Cost of a network in GFLOPs; a multiplication and an addition are two.
+
+    Attributes:
+        image: of one image, without what depends on the number of detections.
+        detection: of the mask and quality of each detection.
     """
 
     image: float
@@ -34,13 +34,18 @@ class Cost:
 
 
 def write_graph(network: MaskRCNN, class_names: list[str], path: Path) -> int:
-    """Export, slim (norms go into their convolutions), check and save; returns the number of nodes.
+    """Export, slim (norms go into their convolutions), check and save a network.
 
-    Raises ExportError when the exporter or the checker refuses.
+    Returns:
+        The number of nodes.
+
+    Raises:
+        ExportError: the exporter failed.
     """
     rows, columns = network.config.canvas
     example = torch.zeros((2, rows + 32, columns + 64, 3), dtype=torch.uint8)
-    free = {i: torch.export.Dim(name) for i, name in enumerate(("batch", "height", "width"))}
+    names = ("batch", "height", "width")
+    dynamic = {axis: torch.export.Dim(name) for axis, name in enumerate(names)}
     program = torch.onnx.export(
         Detector(network).eval(),
         (example,),
@@ -48,7 +53,7 @@ def write_graph(network: MaskRCNN, class_names: list[str], path: Path) -> int:
         opset_version=OPSET,
         input_names=[signature.INPUT],
         output_names=list(signature.OUTPUTS),
-        dynamic_shapes=(free,),
+        dynamic_shapes=(dynamic,),
         custom_translation_table=TRANSLATIONS,
         verbose=False,
     )
@@ -62,19 +67,21 @@ def write_graph(network: MaskRCNN, class_names: list[str], path: Path) -> int:
 
 
 def count_flops(network: MaskRCNN) -> Cost:
-    """Of a network on one image of its canvas; RoIAlign and suppression are not counted."""
+    """Count the FLOPs of a network on a black image of its canvas, without RoIAlign and NMS."""
     rows, columns = network.config.canvas
     counter = FlopCounterMode(display=False)
     with torch.no_grad(), counter:
-        count = Detector(network)(torch.zeros((1, rows, columns, 3), dtype=torch.uint8))[-1]
+        images = torch.zeros((1, rows, columns, 3), dtype=torch.uint8)
+        num_detections = int(Detector(network)(images)[-1])
     by_module = {name: sum(flops.values()) for name, flops in counter.get_flop_counts().items()}
-    masks = sum(by_module.get(f"Detector.network.{name}", 0) for name in _PER_DETECTION)
-    return Cost((counter.get_total_flops() - masks) / 1e9, masks / max(int(count), 1) / 1e9)
+    per_detection = sum(by_module.get(f"Detector.network.{name}", 0) for name in _PER_DETECTION)
+    image_flops = counter.get_total_flops() - per_detection
+    return Cost(image_flops / 1e9, per_detection / max(num_detections, 1) / 1e9)
 
 
 def _metadata(network: MaskRCNN, class_names: list[str]) -> dict[str, str]:
     config = network.config
-    rule = {
+    input_rule = {
         "color": "RGB",
         "layout": "NHWC",
         "dtype": "uint8",
@@ -91,6 +98,6 @@ def _metadata(network: MaskRCNN, class_names: list[str]) -> dict[str, str]:
         signature.KEY_CONTRACT: str(signature.CONTRACT_VERSION),
         signature.KEY_VERSION: __version__,
         signature.KEY_CLASSES: json.dumps(class_names),
-        signature.KEY_INPUT: json.dumps(rule),
+        signature.KEY_INPUT: json.dumps(input_rule),
         signature.KEY_THRESHOLDS: json.dumps(thresholds),
     }

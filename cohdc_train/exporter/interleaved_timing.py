@@ -1,28 +1,32 @@
-"""Timing of things that take turns on the same pictures, so that whatever else the machine does
-hits them all.
-"""
+"""Interleaved timing: runners take turns on the same images, so that all share the load."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from cohdc_train.types import Image
 
-Image = NDArray[np.uint8]
 K = TypeVar("K")
 
 
-def seconds_in_turn(
-    runners: Mapping[K, Callable[[Image], Any]], pictures: Sequence[Image]
+def time_interleaved(
+    runners: Mapping[K, Callable[[Image], Any]], images: Sequence[Image]
 ) -> dict[K, list[float]]:
-    """What each runner took for each picture, uint8 [H, W, 3], s; the first picture is run once
-    before, unmeasured.
+    """Measure the time of each runner on each image, in turn.
+
+    The first image is run once before, without being measured.
+
+    Args:
+        runners: name -> function of an image.
+        images: uint8 [H, W, 3] each.
+
+    Returns:
+        Name -> s per image.
     """
     seconds: dict[K, list[float]] = {name: [] for name in runners}
-    for picture in (pictures[0], *pictures):
+    for image in (images[0], *images):
         for name, run in runners.items():
             start = time.perf_counter()
-            run(picture)
+            run(image)
             seconds[name].append(time.perf_counter() - start)
-    return {name: taken[1:] for name, taken in seconds.items()}
+    return {name: times[1:] for name, times in seconds.items()}

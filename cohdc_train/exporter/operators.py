@@ -1,6 +1,4 @@
-"""What the network's custom operators are in ONNX (opset 18), for the translation table of the
-exporter.
-"""
+"""ONNX translations (opset 18) of the network's custom operators, for torch's exporter."""
 
 import math
 from collections.abc import Callable
@@ -28,13 +26,16 @@ def _range(count: Any) -> Any:
 
 
 def letterbox(images: Any, rows: int, columns: int) -> tuple[Any, Any]:
-    """`models.ops.letterbox`; exclude_outside makes the border's filter weights torch's."""
+    """Translate `models.ops.letterbox`.
+
+    exclude_outside makes the filter weights at the border those of torch.
+    """
     shape = op.Shape(images)
     height, width = op.Gather(shape, _ints(1)), op.Gather(shape, _ints(2))
     tall = op.LessOrEqual(op.Mul(_ints(rows), width), op.Mul(_ints(columns), height))
 
     def fit(side: Any, limit: int, other: Any) -> Any:
-        """max(1, round(side * limit / other)), halves up, in whole numbers."""
+        """Compute max(1, round(side * limit / other)), halves up, in integers."""
         doubled = op.Add(op.Mul(op.Mul(_ints(2), side), _ints(limit)), other)
         return op.Max(_ints(1), op.Div(doubled, op.Mul(_ints(2), other)))
 
@@ -65,7 +66,7 @@ def letterbox(images: Any, rows: int, columns: int) -> tuple[Any, Any]:
 
 
 def nms_keep(boxes: Any, scores: Any, iou_threshold: float, score_threshold: float) -> Any:
-    """`models.ops.nms_keep`: the (image, box) pairs that are kept, scattered into a mask."""
+    """Translate `models.ops.nms_keep`: the (image, box) pairs that NMS keeps, as a mask."""
     wanted = op.Gather(op.Shape(scores), _ints(1))
     kept = op.NonMaxSuppression(
         boxes,
@@ -83,9 +84,7 @@ def nms_keep(boxes: Any, scores: Any, iou_threshold: float, score_threshold: flo
 def roi_pool_levels(
     features: list[Any], boxes: Any, images: Any, strides: list[int], side: int
 ) -> Any:
-    """`models.ops.roi_pool_levels`: one RoiAlign per level over that level's boxes, put back in the
-    boxes' order.
-    """
+    """Translate `models.ops.roi_pool_levels`: one RoiAlign per level, in the boxes' order."""
     sides = op.Sub(
         op.Slice(boxes, _ints(2), _ints(4), _ints(1)), op.Slice(boxes, _ints(0), _ints(2), _ints(1))
     )
@@ -118,7 +117,7 @@ def roi_pool_levels(
 
 
 def rows_to_segment(present: Any) -> Any:
-    """`models.ops.rows_to_segment`."""
+    """Translate `models.ops.rows_to_segment`."""
     first = op.Equal(_range(op.Squeeze(op.Shape(present))), op.Constant(value_int=0))
     return op.Reshape(op.NonZero(op.Or(present, first)), _ints(-1))
 

@@ -1,4 +1,4 @@
-"""What an ONNX file scores on a validation split, beside the network it was written from."""
+"""Scores of a network, and of the ONNX files that are written from it."""
 
 from pathlib import Path
 
@@ -9,25 +9,25 @@ from cohdc_train.validation import score_module, score_segmenter, validation_dat
 SCORES = ("segm_AP", "segm_AP50", "boundary_AP", "box_AP", "S90_matched", "S90_all")
 
 
-class Scorer:
-    """Scores of a network and of files written from it, on the validation split of a COCO-format
-    folder.
+class ValidationScorer:
+    """Scores a network and files written from it on a folder's validation split.
 
-    Raises CohdcError when the folder does not have the checkpoint's classes.
+    Raises:
+        CohdcError: the folder does not have the checkpoint's classes.
     """
 
-    def __init__(self, module: MaskRCNNModule, root: Path, checkpoint: Path) -> None:
+    def __init__(self, module: MaskRCNNModule, data: Path, checkpoint: Path) -> None:
+        """Open the folder with the classes of the checkpoint."""
         self._module = module
-        self._data = validation_data(root, checkpoint, module.class_names)
+        self._data = validation_data(data, checkpoint, module.class_names)
 
-    def network(self) -> dict[str, float]:
-        """SCORES by torch, float32."""
+    def score_network(self) -> dict[str, float]:
+        """Compute SCORES of the network in torch, float32."""
         scores = score_module(self._module, self._data).scores
         return {name: scores[name] for name in SCORES}
 
-    def file(self, path: Path) -> dict[str, float]:
-        """SCORES of an ONNX file, masks ranked as the network's are."""
-        scores = score_segmenter(
-            Segmenter(path), self._data.folder.val, self._module.rescore
-        ).scores
+    def score_file(self, path: Path) -> dict[str, float]:
+        """Compute SCORES of an ONNX file, masks ranked as the network's are."""
+        split = self._data.folder.val
+        scores = score_segmenter(Segmenter(path), split, self._module.rescore).scores
         return {name: scores[name] for name in SCORES}

@@ -1,1 +1,1 @@
-"""A segmenter on images, folders and videos: overlays and annotation files."""
+"""Prediction on images, folders and videos: overlays and annotation files (no torch)."""

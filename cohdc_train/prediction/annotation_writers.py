@@ -1,250 +1,271 @@
-"""What was found, as files that people and tools open: COCO, labelme, YOLO-seg."""
+"""Writers of annotation files that people and tools open: COCO, labelme, YOLO-seg."""
 
 import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol
 
 import yaml
 
-from cohdc_train.contour import Polygon, joined
-from cohdc_train.contour.polygons import FloatArray
+from cohdc_train.contour import Polygon, join_polygons
+from cohdc_train.drawing import write_jpeg
 from cohdc_train.errors import DataError
-from cohdc_train.files import OwnFiles, write_bytes, write_text
-from cohdc_train.prediction.drawing import jpeg
-from cohdc_train.prediction.image_sources import Picture
+from cohdc_train.files import OwnFiles, write_text
+from cohdc_train.prediction.image_sources import SourceImage
+from cohdc_train.prediction.options import AnnotationFormat, PredictOptions
 from cohdc_train.segmenter import Detections
+from cohdc_train.types import FloatArray, Row
 
-Format = Literal["coco", "labelme", "yolo"]
-# What a format writes into the output folder, apart from files named after pictures.
-FILES: dict[Format, tuple[str, ...]] = {
+# Files of each format in the output folder, apart from those named after images.
+FORMAT_FILES: dict[AnnotationFormat, tuple[str, ...]] = {
     "coco": ("predictions.json",),
     "labelme": ("review.txt", "overlays"),
     "yolo": ("data.yaml", "labels", "overlays"),
 }
-_LABELME = "5.5.0"  # whose files these are like
+_LABELME_VERSION = "5.5.0"  # of labelme, whose files these are like
 
 
-class Found(NamedTuple):
-    """The objects of one picture, without its pixels.
+class ImageDetections(NamedTuple):
+    """Detections of one image, without its pixels.
 
-    name: the picture's file name; size: (height, width) px; found: the detections; outlines:
-    polygons of each.
+    Attributes:
+        name: file name of the image.
+        size: (height, width), px.
+        detections: of the image.
+        outlines: polygons of each detection.
     """
 
     name: str
     size: tuple[int, int]
-    found: Detections
+    detections: Detections
     outlines: list[list[Polygon]]
 
-    @classmethod
-    def of(cls, picture: Picture, found: Detections, outlines: list[list[Polygon]]) -> Self:
-        """The objects of a picture."""
-        return cls(picture.name, (picture.rgb.shape[0], picture.rgb.shape[1]), found, outlines)
+
+class AnnotationWriter(Protocol):
+    """Writer of one format."""
+
+    def write_image(self, image: SourceImage, result: ImageDetections, /) -> None:
+        """Write the files of one image."""
+
+    def finish(self, results: Sequence[ImageDetections], content: dict[str, Any], /) -> None:
+        """Write the files of all images. content: their COCO dictionary."""
 
 
-class Files(Protocol):
-    """How one format is written: picture by picture, and at the end."""
+def open_writer(
+    out: Path, own: OwnFiles, class_names: tuple[str, ...], options: PredictOptions
+) -> AnnotationWriter:
+    """Make the writer of the format that the options ask for.
 
-    def picture(self, picture: Picture, one: Found, /) -> None:
-        """What belongs to one picture."""
-
-    def close(self, seen: Sequence[Found], content: dict[str, Any], /) -> None:
-        """What belongs to all of them; content: their COCO dictionary."""
-
-
-def open_format(
-    format: Format,
-    out: Path,
-    own: OwnFiles,
-    class_names: tuple[str, ...],
-    check_below: float,
-) -> Files:
-    """Return the writer of a format into a folder.
-
-    own: the files of this run in `out`; check_below: quality below which labelme shapes are marked.
+    Args:
+        out: folder for the files.
+        own: files of this run in it.
+        class_names: name of each label.
+        options: of the prediction.
     """
-    if format == "labelme":
-        return _Labelme(out, own, class_names, check_below)
-    return _Yolo(out, own, class_names) if format == "yolo" else _Coco(out)
+    if options.format == "labelme":
+        return LabelmeWriter(out, own, class_names, options.check_below)
+    if options.format == "yolo":
+        return YoloWriter(out, own, class_names)
+    return CocoWriter(out)
 
 
-def coco(seen: Sequence[Found], class_names: Sequence[str]) -> dict[str, Any]:
-    """A COCO dictionary; annotations have `score`, `quality`, `category` and `file_name` besides
-    COCO's own fields.
+def coco_content(results: Sequence[ImageDetections], class_names: Sequence[str]) -> dict[str, Any]:
+    """Build a COCO dictionary.
+
+    Annotations also have `score`, `quality`, `category` and `file_name`.
+
+    Args:
+        results: one per image.
+        class_names: name of each label.
     """
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    for image_id, one in enumerate(seen, start=1):
-        height, width = one.size
-        images.append({"id": image_id, "file_name": one.name, "width": width, "height": height})
-        for row, outline in enumerate(one.outlines):
-            entry = {"id": len(annotations) + 1, "image_id": image_id, "file_name": one.name}
-            annotations.append(entry | _annotation(one.found, row, outline))
+    images: list[Row] = []
+    annotations: list[Row] = []
+    for image_id, result in enumerate(results, start=1):
+        height, width = result.size
+        name = result.name
+        images.append({"id": image_id, "file_name": name, "width": width, "height": height})
+        for index, outline in enumerate(result.outlines):
+            ids = {"id": len(annotations) + 1, "image_id": image_id, "file_name": name}
+            annotations.append(ids | _annotation(result.detections, index, outline))
     categories = [{"id": label + 1, "name": name} for label, name in enumerate(class_names)]
     return {"images": images, "categories": categories, "annotations": annotations}
 
 
-def _annotation(found: Detections, row: int, outline: list[Polygon]) -> dict[str, Any]:
-    x0, y0, x1, y1 = (float(v) for v in found.boxes[row])
-    label = int(found.labels[row])
+def _annotation(detections: Detections, index: int, outline: list[Polygon]) -> Row:
+    x0, y0, x1, y1 = (float(v) for v in detections.boxes[index])
+    label = int(detections.labels[index])
     rings = [polygon.keyhole() for polygon in outline]
     return {
         "category_id": label + 1,
-        "category": found.class_names[label],
+        "category": detections.class_names[label],
         "bbox": [round(v, 2) for v in (x0, y0, x1 - x0, y1 - y0)],
-        **_trust(found, row),
-        "segmentation": [_numbers(ring) for ring in rings],
+        **_score_and_quality(detections, index),
+        "segmentation": [_coordinates(ring) for ring in rings],
         "area": round(sum(_area(ring) for ring in rings), 2),
         "iscrowd": 0,
     }
 
 
-def _trust(found: Detections, row: int) -> dict[str, float]:
+def _score_and_quality(detections: Detections, index: int) -> dict[str, float]:
     return {
-        "score": round(float(found.scores[row]), 5),
-        "quality": round(float(found.quality[row]), 5),
+        "score": round(float(detections.scores[index]), 5),
+        "quality": round(float(detections.quality[index]), 5),
     }
 
 
 def _area(ring: FloatArray) -> float:
+    """Compute the area of a ring [n, 2] by the shoelace formula, px^2."""
     x, y = ring.T
-    before, behind = [*range(-1, len(x) - 1)], [*range(1, len(x)), 0]
-    return float(abs(x @ (y[behind] - y[before])) / 2)
+    previous, following = [*range(-1, len(x) - 1)], [*range(1, len(x)), 0]
+    return float(abs(x @ (y[following] - y[previous])) / 2)
 
 
-def _numbers(ring: FloatArray) -> list[float]:
-    """x, y, x, y, ... on the grid of a tenth of a pixel that outlines have; whole numbers without a
-    point.
-    """
-    return [
-        int(value) if value == int(value) else value for value in ring.ravel().round(1).tolist()
-    ]
+def _coordinates(ring: FloatArray) -> list[float]:
+    """List x, y, x, y, ... of a ring to a tenth of a pixel, whole numbers without a point."""
+    values = ring.ravel().round(1).tolist()
+    return [int(value) if value == int(value) else value for value in values]
 
 
-class _Coco:
-    """predictions.json."""
+class CocoWriter:
+    """Writer of predictions.json."""
 
     def __init__(self, out: Path) -> None:
+        """Write into a folder."""
         self._out = out
 
-    def picture(self, picture: Picture, one: Found) -> None:
-        return
+    def write_image(self, image: SourceImage, result: ImageDetections) -> None:
+        """Write nothing: one file holds all images."""
 
-    def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
+    def finish(self, results: Sequence[ImageDetections], content: dict[str, Any]) -> None:
+        """Write predictions.json."""
         write_text(self._out / "predictions.json", json.dumps(content, separators=(",", ":")))
 
 
-class _Labelme:
-    """<name>.json per picture, and review.txt.
+class LabelmeWriter:
+    """Writer of <name>.json per image, and review.txt.
 
-    Parts of an object share a group; holes are joined to the outer ring. The picture is named
-    relative to the folder; frames are written beside their file.
+    Parts of an object share a group; holes are joined to the outer ring. Images are named relative
+    to the folder; frames of a video are written next to their file.
     """
 
     def __init__(
-        self,
-        out: Path,
-        own: OwnFiles,
-        class_names: tuple[str, ...],
-        check_below: float,
+        self, out: Path, own: OwnFiles, class_names: tuple[str, ...], check_below: float
     ) -> None:
-        self._out, self._own, self._names, self._check = out, own, class_names, check_below
+        """Write into a folder; mark contours whose quality is below `check_below`."""
+        self._out = out
+        self._own = own
+        self._class_names = class_names
+        self._check_below = check_below
 
-    def picture(self, picture: Picture, one: Found) -> None:
-        file = self._out / f"{picture.stem}.json"
+    def write_image(self, image: SourceImage, result: ImageDetections) -> None:
+        """Write <name>.json, and the image where it has no file.
+
+        Raises:
+            DataError: there is such a file, which may hold somebody's work.
+        """
+        file = self._out / f"{image.stem}.json"
         if file.exists():
-            raise DataError(
-                f"{file}: is there already, perhaps corrected by hand; give a new folder"
-            )
-        path = f"{picture.stem}.jpg"
-        if picture.path is not None:
-            path = Path(os.path.relpath(picture.path.resolve(), self._out.resolve())).as_posix()
+            raise DataError(f"{file}: exists, perhaps corrected by hand; give a new folder")
+        if image.path is None:
+            image_path = f"{image.stem}.jpg"
+            write_jpeg(self._own.path(image_path), image.rgb)
         else:
-            write_bytes(self._own.path(path), jpeg(picture.rgb))
-        height, width = one.size
-        content: dict[str, Any] = {"version": _LABELME, "flags": {}, "shapes": self._shapes(one)}
-        content |= {
-            "imagePath": path,
+            relative = os.path.relpath(image.path.resolve(), self._out.resolve())
+            image_path = Path(relative).as_posix()
+        height, width = result.size
+        content: dict[str, Any] = {
+            "version": _LABELME_VERSION,
+            "flags": {},
+            "shapes": self._shapes(result),
+            "imagePath": image_path,
             "imageData": None,
             "imageHeight": height,
             "imageWidth": width,
         }
         write_text(self._own.path(file.name), json.dumps(content, indent=1))
 
-    def _shapes(self, one: Found) -> list[dict[str, Any]]:
+    def _shapes(self, result: ImageDetections) -> list[Row]:
+        """Build the shapes of all objects, the lowest quality first."""
         shapes = []
-        for row in one.found.quality.argsort(kind="stable").tolist():
-            trust = _trust(one.found, row)
-            outline = one.outlines[row]
-            for polygon in outline:
-                numbers = _numbers(polygon.keyhole())
-                shape: dict[str, Any] = {"label": self._names[int(one.found.labels[row])]}
-                shape["points"] = [
-                    list(pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)
-                ]
-                shape |= {
-                    "group_id": row if len(outline) > 1 else None,
-                    "shape_type": "polygon",
-                    "mask": None,
-                }
-                shape["description"] = f"score {trust['score']:.2f} quality {trust['quality']:.2f}"
-                shape["flags"] = {"check": trust["quality"] < self._check}
-                shapes.append(shape)
+        for index in result.detections.quality.argsort(kind="stable").tolist():
+            outline = result.outlines[index]
+            group = index if len(outline) > 1 else None
+            shapes += [self._shape(result.detections, index, part, group) for part in outline]
         return shapes
 
-    def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
-        todo = [(int((one.found.quality < self._check).sum()), one) for one in seen]
+    def _shape(
+        self, detections: Detections, index: int, polygon: Polygon, group: int | None
+    ) -> Row:
+        coordinates = _coordinates(polygon.keyhole())
+        pairs = zip(coordinates[::2], coordinates[1::2], strict=True)
+        values = _score_and_quality(detections, index)
+        return {
+            "label": self._class_names[int(detections.labels[index])],
+            "points": [list(pair) for pair in pairs],
+            "group_id": group,
+            "shape_type": "polygon",
+            "mask": None,
+            "description": f"score {values['score']:.2f} quality {values['quality']:.2f}",
+            "flags": {"check": values["quality"] < self._check_below},
+        }
+
+    def finish(self, results: Sequence[ImageDetections], content: dict[str, Any]) -> None:
+        """Write review.txt: the images by the number of contours to check."""
+        reviews = []
+        for result in results:
+            quality = result.detections.quality
+            count = int((quality < self._check_below).sum())
+            if count:
+                reviews.append((-count, quality.min(), result))
+        reviews.sort(key=lambda review: review[:2])
         lines = [
-            f"{one.name}: {count} of {len(one.outlines)} contours to check, the worst of quality "
-            f"{one.found.quality.min():.2f}"
-            for count, one in sorted(
-                todo, key=lambda entry: (-entry[0], entry[1].found.quality.min(initial=1))
-            )
-            if count
+            f"{result.name}: {-count} of {len(result.outlines)} contours to check, "
+            f"the worst of quality {lowest:.2f}\n"
+            for count, lowest, result in reviews
         ]
-        write_text(
-            self._out / "review.txt", "\n".join([*lines, ""]) if lines else "no contour to check\n"
-        )
+        write_text(self._out / "review.txt", "".join(lines) or "no contour to check\n")
 
 
-class _Yolo:
-    """labels/<name>.txt per picture and data.yaml: `class x y x y ...`, shares of the picture's
-    width and height.
+class YoloWriter:
+    """Writer of labels/<name>.txt per image, and data.yaml.
 
-    An object is one line: holes and further parts are joined by bridges of no width. There is no
-    place for score and quality. data.yaml has the names only: for a training, labels/ goes beside
-    the folder images/, and frames of a video are written to images/ here. Labels belong to pictures
-    by their stem, so that no two may have the same.
+    A line is an object: `class x y x y ...`, in shares of the image's width and height. Holes and
+    further parts are joined by bridges of no width. There is no place for score and quality.
+    data.yaml has the names only: for a training, put labels/ next to the folder images/, where
+    frames of a video are written. Labels belong to images by their stem, so no two may share it.
     """
 
     def __init__(self, out: Path, own: OwnFiles, class_names: tuple[str, ...]) -> None:
-        self._out, self._own, self._names = out, own, class_names
+        """Write into a folder, and make labels/ in it."""
+        self._out = out
+        self._own = own
+        self._class_names = class_names
         (out / "labels").mkdir(exist_ok=True)
 
-    def picture(self, picture: Picture, one: Found) -> None:
-        if picture.path is None:
-            (self._out / "images").mkdir(exist_ok=True)
-            write_bytes(self._own.path(f"images/{picture.name}"), jpeg(picture.rgb))
-        elif picture.stem != picture.path.stem:
-            raise DataError(
-                f"{picture.path}: another image has this stem, and YOLO labels are found by it"
-            )
-        height, width = one.size
-        lines = []
-        for label, outline in zip(one.found.labels.tolist(), one.outlines, strict=True):
-            shares = (joined(outline) / (width, height)).ravel()
-            lines.append(
-                " ".join(
-                    [str(label), *(f"{share:.6f}".rstrip("0").rstrip(".") for share in shares)]
-                )
-            )
-        labels = self._own.path(f"labels/{picture.stem}.txt")
-        write_text(labels, "".join(f"{line}\n" for line in lines))
+    def write_image(self, image: SourceImage, result: ImageDetections) -> None:
+        """Write labels/<name>.txt, and images/<name>.jpg where the image has no file.
 
-    def close(self, seen: Sequence[Found], content: dict[str, Any]) -> None:
-        write_text(
-            self._out / "data.yaml",
-            yaml.safe_dump({"names": dict(enumerate(self._names))}, sort_keys=False),
-        )
+        Raises:
+            DataError: another image has the same stem.
+        """
+        if image.path is None:
+            (self._out / "images").mkdir(exist_ok=True)
+            write_jpeg(self._own.path(f"images/{image.name}"), image.rgb)
+        elif image.stem != image.path.stem:
+            raise DataError(
+                f"{image.path}: another image has this stem, and YOLO labels are found by it"
+            )
+        height, width = result.size
+        lines = []
+        labels = result.detections.labels.tolist()
+        for label, outline in zip(labels, result.outlines, strict=True):
+            shares = (join_polygons(outline) / (width, height)).ravel()
+            words = [f"{share:.6f}".rstrip("0").rstrip(".") for share in shares]
+            lines.append(" ".join([str(label), *words]) + "\n")
+        write_text(self._own.path(f"labels/{image.stem}.txt"), "".join(lines))
+
+    def finish(self, results: Sequence[ImageDetections], content: dict[str, Any]) -> None:
+        """Write data.yaml."""
+        names = {"names": dict(enumerate(self._class_names))}
+        write_text(self._out / "data.yaml", yaml.safe_dump(names, sort_keys=False))

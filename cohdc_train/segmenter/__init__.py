@@ -1,4 +1,4 @@
-"""An ONNX file -> detections (onnxruntime, never torch)."""
+"""Instance segmentation by an ONNX file (onnxruntime, no torch)."""
 
 from cohdc_train.segmenter.detections import Detections
 from cohdc_train.segmenter.segmenter import Segmenter

@@ -1,21 +1,18 @@
-"""Graphs of other exporters, recognised by their inputs and outputs and read as if they kept the
-contract.
+"""Adapters of other exporters' ONNX files, recognized by their inputs and outputs.
 
-| kind | input, RGB in 0..1 | outputs |
+| adapter | input, RGB in 0..1 | outputs |
 |---|---|---|
-| `YoloSeg` | float [1, 3, S, S], letterboxed in the centre on grey | candidates, prototypes [1, P,
-h, w] |
-| `TorchvisionMaskRCNN` | float [3, H, W] | boxes [n, 4], labels [n] from 1, scores [n], masks [n,
-1, H, W] |
+| `YoloSeg` | [1, 3, S, S], centered on gray | candidates, prototypes [1, P, h, w] |
+| `TorchvisionMaskRCNN` | [3, H, W] | boxes [n, 4], labels [n], scores [n], masks [n, 1, H, W] |
 
-Candidates are [1, 4 + C + P, n]: box cx, cy, w, h in canvas px, class scores, mask coefficients;
-or, of networks that suppress by themselves, [1, n, 6 + P]: box x0, y0, x1, y1, score, class, mask
-coefficients. Neither kind has a CQE head: quality is 1.
+Candidates are [1, 4 + C + P, n]: box cx, cy, w, h in canvas px, class scores, mask coefficients.
+Networks with NMS inside give [1, n, 6 + P]: box x0, y0, x1, y1, score, class, mask coefficients.
+torchvision's labels start at 1. None of them has a CQE head: quality is 1.
 """
 
 import ast
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,82 +20,98 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import ContractError
 from cohdc_train.segmenter.detections import Detections
-
-Image = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+from cohdc_train.types import Float32Array, Image
 
 SCORE_THRESHOLD = 0.05  # as in the files of `cohdc export`
-MOST = 100  # detections of an image
+MAX_DETECTIONS = 100  # per image
 _NMS_IOU = 0.7
-_ROI = 56  # cells a side of the masks that are cut out of maps
-_GREY = 114  # of the letterbox's border
+_ROI_CELLS = 56  # side of the masks that are cut out of maps
+_GRAY = 114  # of the letterbox's border
+_DEFAULT_SIDE = 640  # px, of YOLO networks whose input size is free
+_DEFAULT_CLASSES = 90  # COCO's, where neither names nor a number of classes are known
+
+
+class _Candidates(NamedTuple):
+    """Detections of a one-stage network after NMS.
+
+    boxes: [n, 4] xyxy, canvas px; labels: [n]; scores: [n]; coefficients: [n, P] of the masks.
+    """
+
+    boxes: NDArray[Any]
+    labels: NDArray[Any]
+    scores: NDArray[Any]
+    coefficients: NDArray[Any]
 
 
 class YoloSeg:
-    """A one-stage segmenter with prototypes, as YOLO-seg networks are exported."""
+    """Adapter of one-stage segmenters with mask prototypes, as YOLO-seg networks are exported."""
 
     def __init__(self, path: Path, session: Any, metadata: dict[str, str]) -> None:
+        """Read the sizes and class names of a file."""
         self._session = session
-        shape = session.get_inputs()[0].shape
-        table, maps = _by_rank(session)
-        self._outputs = [table.name, maps.name]
-        self._suppressed = table.shape[2] == 6 + maps.shape[1]
-        self.class_names = _names(
-            path, metadata, None if self._suppressed else table.shape[1] - 4 - maps.shape[1]
-        )
-        sides = [
-            side if isinstance(side, int) else 640 for side in shape[2:]
-        ]  # a free size runs at the usual 640
-        self.canvas: tuple[int, int] | None = (sides[0], sides[1])
+        candidates, prototypes = _outputs_by_rank(session)
+        self._outputs = [candidates.name, prototypes.name]
+        num_prototypes = prototypes.shape[1]
+        self._has_nms = candidates.shape[2] == 6 + num_prototypes
+        num_classes = None if self._has_nms else candidates.shape[1] - 4 - num_prototypes
+        self.class_names = _read_class_names(path, metadata, num_classes)
+
+        sides = session.get_inputs()[0].shape[2:]
+        rows, columns = (side if isinstance(side, int) else _DEFAULT_SIDE for side in sides)
+        self._input_size = (rows, columns)
+        self.canvas: tuple[int, int] | None = self._input_size
 
     @staticmethod
     def matches(session: Any) -> bool:
-        """One image in, a table of candidates and prototypes out."""
+        """Check for one image as input, and candidates and prototypes as outputs."""
         inputs, outputs = session.get_inputs(), session.get_outputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 4 or len(outputs) != 2:
             return False
-        table, maps = (out.shape for out in _by_rank(session))
-        if len(table) != 3 or len(maps) != 4 or not isinstance(maps[1], int):
+        candidates, prototypes = (value.shape for value in _outputs_by_rank(session))
+        if len(candidates) != 3 or len(prototypes) != 4 or not isinstance(prototypes[1], int):
             return False
-        return table[2] == 6 + maps[1] or (isinstance(table[1], int) and table[1] > 4 + maps[1])
+        if candidates[2] == 6 + prototypes[1]:
+            return True
+        return isinstance(candidates[1], int) and candidates[1] > 4 + prototypes[1]
 
     def run(self, rgb: Image) -> Detections:
-        """rgb: uint8 [H, W, 3]."""
-        assert self.canvas is not None
-        fitted, scale, (left, top) = _letterbox(rgb, self.canvas)
+        """Segment an image. rgb: uint8 [H, W, 3]."""
+        fitted, scale, (left, top) = _letterbox(rgb, self._input_size)
         blob = np.ascontiguousarray(fitted.transpose(2, 0, 1)[None]).astype(np.float32) / 255
-        name = self._session.get_inputs()[0].name
-        table, prototypes = (out[0] for out in self._session.run(self._outputs, {name: blob}))
-        boxes, labels, scores, coefficients = (
-            _last(table) if self._suppressed else _best(table, len(prototypes))
-        )
+        inputs = {self._session.get_inputs()[0].name: blob}
+        table, prototypes = (out[0] for out in self._session.run(self._outputs, inputs))
+        found = _sort_rows(table) if self._has_nms else _apply_nms(table, len(prototypes))
+
         height, width = rgb.shape[:2]
-        corner = np.array([left, top, left, top], np.float32)
+        origin = np.array([left, top, left, top], np.float32)
         limit = np.array([width, height, width, height], np.float32)
-        in_image = np.clip((boxes - corner) / scale, 0, limit)
-        cells = (in_image * scale + corner) / (self.canvas[0] / prototypes.shape[1])
-        maps = np.tensordot(coefficients, prototypes, axes=1)
-        masks = [_sigmoid(_cut(field, box)) for field, box in zip(maps, cells, strict=True)]
-        return _detections(in_image, labels, scores, masks, (height, width), self.class_names)
+        boxes = np.clip((found.boxes - origin) / scale, 0, limit)
+        stride = self._input_size[0] / prototypes.shape[1]
+        map_boxes = (boxes * scale + origin) / stride
+        maps = np.tensordot(found.coefficients, prototypes, axes=1)
+        masks = [_sigmoid(_crop(m, box)) for m, box in zip(maps, map_boxes, strict=True)]
+        size = (height, width)
+        return _detections(boxes, found.labels, found.scores, masks, size, self.class_names)
 
 
 class TorchvisionMaskRCNN:
-    """torchvision's Mask R-CNN, as torch's exporter by tracing writes it; it holds no class names."""
+    """Adapter of torchvision's Mask R-CNN, as torch's tracing exporter writes it."""
 
     def __init__(self, path: Path, session: Any, metadata: dict[str, str]) -> None:
+        """Read the sizes and class names of a file."""
         self._session = session
-        shape = session.get_inputs()[0].shape[1:]
-        fixed = all(isinstance(side, int) for side in shape)
-        self.canvas: tuple[int, int] | None = (shape[0], shape[1]) if fixed else None
-        self.class_names = _names(path, metadata, None)
+        rows, columns = session.get_inputs()[0].shape[1:]
+        is_fixed = isinstance(rows, int) and isinstance(columns, int)
+        self.canvas: tuple[int, int] | None = (rows, columns) if is_fixed else None
+        self.class_names = _read_class_names(path, metadata, None)
 
     @staticmethod
     def matches(session: Any) -> bool:
-        """One image without a batch in; boxes, labels, scores and masks out."""
+        """Check for one image without a batch as input, and boxes, labels, scores and masks."""
         inputs, outputs = session.get_inputs(), session.get_outputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 3 or inputs[0].shape[0] != 3:
             return False
-        return sorted((out.type, len(out.shape)) for out in outputs) == [
+        return sorted((value.type, len(value.shape)) for value in outputs) == [
             ("tensor(float)", 1),
             ("tensor(float)", 2),
             ("tensor(float)", 4),
@@ -106,145 +119,155 @@ class TorchvisionMaskRCNN:
         ]
 
     def run(self, rgb: Image) -> Detections:
-        """rgb: uint8 [H, W, 3]."""
+        """Segment an image. rgb: uint8 [H, W, 3]."""
         height, width = rgb.shape[:2]
         rows, columns = self.canvas or (height, width)
         fitted = rgb if (rows, columns) == (height, width) else cv2.resize(rgb, (columns, rows))
         blob = np.ascontiguousarray(fitted.transpose(2, 0, 1)).astype(np.float32) / 255
-        found = self._session.run(None, {self._session.get_inputs()[0].name: blob})
-        (labels,) = (out for out in found if out.dtype == np.int64)
-        by_rank = {out.ndim: out for out in found if out.dtype == np.float32}
+        outputs = self._session.run(None, {self._session.get_inputs()[0].name: blob})
+        (labels,) = (out for out in outputs if out.dtype == np.int64)
+        by_rank = {out.ndim: out for out in outputs if out.dtype == np.float32}
         scores, boxes, maps = by_rank[1], by_rank[2], by_rank[4][:, 0]
-        kept = np.flatnonzero(scores > SCORE_THRESHOLD)
-        kept = kept[np.argsort(-scores[kept], kind="stable")][:MOST]
-        masks = [_cut(maps[i], boxes[i]) for i in kept]
-        in_image = boxes[kept] * np.array([width / columns, height / rows] * 2, np.float32)
-        return _detections(
-            in_image, labels[kept] - 1, scores[kept], masks, (height, width), self.class_names
-        )
+
+        keep = np.flatnonzero(scores > SCORE_THRESHOLD)
+        keep = keep[np.argsort(-scores[keep], kind="stable")][:MAX_DETECTIONS]
+        masks = [_crop(maps[i], boxes[i]) for i in keep]
+        boxes = boxes[keep] * np.array([width / columns, height / rows] * 2, np.float32)
+        size = (height, width)
+        return _detections(boxes, labels[keep] - 1, scores[keep], masks, size, self.class_names)
 
 
-FOREIGN = (YoloSeg, TorchvisionMaskRCNN)
+ADAPTERS = (YoloSeg, TorchvisionMaskRCNN)
 
 
-def _by_rank(session: Any) -> list[Any]:
-    return sorted(session.get_outputs(), key=lambda out: len(out.shape))
+def _outputs_by_rank(session: Any) -> list[Any]:
+    return sorted(session.get_outputs(), key=lambda value: len(value.shape))
 
 
-def _best(table: Floats, prototypes: int) -> tuple[NDArray[Any], ...]:
-    """Boxes xyxy in canvas px, labels, scores and coefficients of candidates [4 + C + P, n] behind
-    suppression.
-    """
-    centre, size, classes, coefficients = np.split(table, [2, 4, len(table) - prototypes])
+def _apply_nms(table: Float32Array, num_prototypes: int) -> _Candidates:
+    """Suppress overlapping candidates of the same class. table: [4 + C + P, n]."""
+    center, size, classes, coefficients = np.split(table, [2, 4, len(table) - num_prototypes])
     scores, labels = classes.max(axis=0), classes.argmax(axis=0)
     likely = np.flatnonzero(scores > SCORE_THRESHOLD)
-    corner = centre - size / 2
+    top_left = center - size / 2
     chosen = cv2.dnn.NMSBoxesBatched(
-        np.concatenate([corner, size])[:, likely].T.astype(float).tolist(),
+        np.concatenate([top_left, size])[:, likely].T.astype(float).tolist(),
         scores[likely].astype(float).tolist(),
         labels[likely].tolist(),
         SCORE_THRESHOLD,
         _NMS_IOU,
     )
     rows = likely[np.asarray(chosen, dtype=np.int64).reshape(-1)]
-    rows = rows[np.argsort(-scores[rows], kind="stable")][:MOST]
-    return (
-        np.concatenate([corner, corner + size])[:, rows].T,
-        labels[rows],
-        scores[rows],
-        coefficients[:, rows].T,
-    )
+    rows = rows[np.argsort(-scores[rows], kind="stable")][:MAX_DETECTIONS]
+    boxes = np.concatenate([top_left, top_left + size])[:, rows].T
+    return _Candidates(boxes, labels[rows], scores[rows], coefficients[:, rows].T)
 
 
-def _last(table: Floats) -> tuple[NDArray[Any], ...]:
-    """The same of rows [n, 6 + P] that were suppressed in the graph."""
+def _sort_rows(table: Float32Array) -> _Candidates:
+    """Sort candidates that went through NMS inside the network. table: [n, 6 + P]."""
     rows = table[table[:, 4] > SCORE_THRESHOLD]
-    rows = rows[np.argsort(-rows[:, 4], kind="stable")][:MOST]
-    return rows[:, :4], rows[:, 5].astype(np.int64), rows[:, 4], rows[:, 6:]
+    rows = rows[np.argsort(-rows[:, 4], kind="stable")][:MAX_DETECTIONS]
+    return _Candidates(rows[:, :4], rows[:, 5].astype(np.int64), rows[:, 4], rows[:, 6:])
 
 
 def _detections(
     boxes: NDArray[Any],
     labels: NDArray[Any],
     scores: NDArray[Any],
-    masks: list[Floats],
+    masks: list[Float32Array],
     size: tuple[int, int],
-    names: tuple[str, ...],
+    class_names: tuple[str, ...],
 ) -> Detections:
-    if len(labels) and labels.max() >= len(names):
+    """Build the detections. masks: [_ROI_CELLS, _ROI_CELLS] each; size: (height, width) px."""
+    if len(labels) and labels.max() >= len(class_names):
         raise ContractError(
-            f"class {labels.max() + 1} of a foreign graph has no name; {len(names)} are given"
+            f"class {labels.max() + 1} of the network has no name; {len(class_names)} are given"
         )
-    cells = np.stack(masks) if masks else np.zeros((0, _ROI, _ROI), np.float32)
+    empty = np.zeros((0, _ROI_CELLS, _ROI_CELLS), np.float32)
     return Detections(
         boxes.astype(np.float32).reshape(-1, 4),
         labels.astype(np.int64),
         scores.astype(np.float32),
         np.ones(len(labels), np.float32),
-        cells,
+        np.stack(masks) if masks else empty,
         size,
-        names,
+        class_names,
     )
 
 
-def _names(path: Path, metadata: dict[str, str], classes: int | None) -> tuple[str, ...]:
-    """Class names: of the metadata ("names", a list or {label: name}), of `<file>.txt`, or numbers
-    from 1.
+def _read_class_names(
+    path: Path, metadata: dict[str, str], num_classes: int | None
+) -> tuple[str, ...]:
+    """Read the class names from the metadata's "names", else from `<file>.txt`, else count from 1.
 
-    Raises ContractError when there are fewer than `classes`.
+    Raises:
+        ContractError: they cannot be read, or there are not `num_classes` of them.
     """
-    listed = path.with_name(path.name + ".txt")
+    text_file = path.with_name(path.name + ".txt")
     if "names" in metadata:
-        try:
-            given = ast.literal_eval(metadata["names"])
-            names = (
-                [given[i] for i in range(len(given))] if isinstance(given, dict) else list(given)
-            )
-        except (KeyError, SyntaxError, TypeError, ValueError) as error:
-            raise ContractError(
-                f"{path}: its class names cannot be read: {metadata['names']:.40}"
-            ) from error
-    elif listed.is_file():
-        names = listed.read_text(encoding="utf-8").split("\n")
+        names = _parse_names(path, metadata["names"])
+    elif text_file.is_file():
+        names = text_file.read_text(encoding="utf-8").split("\n")
         names = names[:-1] if names[-1] == "" else names
     else:
-        names = [str(i + 1) for i in range(classes or 90)]
-    if classes is not None and len(names) != classes:
-        raise ContractError(f"{path}: {len(names)} class names for {classes} classes")
-    return tuple(str(name) for name in names)
+        names = [str(i + 1) for i in range(num_classes or _DEFAULT_CLASSES)]
+    if num_classes is not None and len(names) != num_classes:
+        raise ContractError(f"{path}: {len(names)} class names for {num_classes} classes")
+    return tuple(names)
+
+
+def _parse_names(path: Path, text: str) -> list[str]:
+    """Parse a Python list of names, or a dict label -> name."""
+    try:
+        value = ast.literal_eval(text)
+        names = [value[i] for i in range(len(value))] if isinstance(value, dict) else list(value)
+    except (KeyError, SyntaxError, TypeError, ValueError) as error:
+        raise ContractError(f"{path}: its class names cannot be read: {text:.40}") from error
+    return [str(name) for name in names]
 
 
 def _letterbox(rgb: Image, canvas: tuple[int, int]) -> tuple[Image, float, tuple[int, int]]:
-    """An image in the centre of a grey canvas; canvas px per image px, and where its left and top
-    edges lie.
+    """Fit an image into the center of a gray canvas.
+
+    Args:
+        rgb: uint8 [H, W, 3].
+        canvas: (height, width), px.
+
+    Returns:
+        The canvas, canvas px per image px, and the left and top of the image on it.
     """
     rows, columns = canvas
     height, width = rgb.shape[:2]
     scale = min(rows / height, columns / width)
-    inner = (max(1, round(width * scale)), max(1, round(height * scale)))
-    left, top = round((columns - inner[0]) / 2 - 0.1), round((rows - inner[1]) / 2 - 0.1)
-    fitted = np.full((rows, columns, 3), _GREY, np.uint8)
-    fitted[top : top + inner[1], left : left + inner[0]] = cv2.resize(
-        rgb, inner, interpolation=cv2.INTER_LINEAR
-    )
+    inner_width, inner_height = max(1, round(width * scale)), max(1, round(height * scale))
+    left = round((columns - inner_width) / 2 - 0.1)
+    top = round((rows - inner_height) / 2 - 0.1)
+    resized = cv2.resize(rgb, (inner_width, inner_height), interpolation=cv2.INTER_LINEAR)
+    fitted = np.full((rows, columns, 3), _GRAY, np.uint8)
+    fitted[top : top + inner_height, left : left + inner_width] = resized
     return fitted, scale, (left, top)
 
 
-def _cut(field: Floats, box: NDArray[Any]) -> Floats:
-    """[_ROI, _ROI] of a map [h, w] inside a box, in the map's cells: sampled at the centres of a
-    grid over it.
+def _crop(field: Float32Array, box: NDArray[Any]) -> Float32Array:
+    """Sample a map inside a box at the cell centers of a square grid.
+
+    Args:
+        field: [h, w].
+        box: [4] xyxy, in cells of the map.
+
+    Returns:
+        [_ROI_CELLS, _ROI_CELLS].
     """
     x0, y0, x1, y1 = (float(v) for v in box)
-    centres = (np.arange(_ROI) + 0.5) / _ROI
-    u = (x0 + centres * (x1 - x0) - 0.5).astype(np.float32)
-    v = (y0 + centres * (y1 - y0) - 0.5).astype(np.float32)
+    centers = (np.arange(_ROI_CELLS) + 0.5) / _ROI_CELLS
+    u = (x0 + centers * (x1 - x0) - 0.5).astype(np.float32)
+    v = (y0 + centers * (y1 - y0) - 0.5).astype(np.float32)
     grid_u, grid_v = np.meshgrid(u, v)
     field = np.ascontiguousarray(field, dtype=np.float32)
-    return np.asarray(
-        cv2.remap(field, grid_u, grid_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        dtype=np.float32,
-    )
+    border = cv2.BORDER_REPLICATE
+    cells = cv2.remap(field, grid_u, grid_v, cv2.INTER_LINEAR, borderMode=border)
+    return np.asarray(cells, dtype=np.float32)
 
 
-def _sigmoid(x: NDArray[Any]) -> Floats:
+def _sigmoid(x: NDArray[Any]) -> Float32Array:
     return np.asarray(1 / (1 + np.exp(-np.clip(x, -50, 50))), dtype=np.float32)

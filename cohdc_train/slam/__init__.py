@@ -1,0 +1,1 @@
+"""RGB-D SLAM that survives moving people (no torch)."""

@@ -1,192 +1,225 @@
-"""`cohdc slam`: an RGB-D sequence in, a trajectory and its scores out."""
+"""`cohdc slam` and `run_slam`: a sequence or a camera in, a trajectory and its scores out."""
 
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from cohdc_train import __version__
 from cohdc_train.errors import DataError
-from cohdc_train.slam.config import MAX_KEYPOINTS, Culling, Method
+from cohdc_train.slam.config import SlamConfig, as_plain
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, no_masks
 from cohdc_train.slam.frame import PoseCallback
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.growing_sequence import Followed
-from cohdc_train.slam.io.live import stopped_by_ctrl_c
-from cohdc_train.slam.io.results import check_out, measure, publish_run, write_run
-from cohdc_train.slam.io.sources import Recorded, Source, rgbd_layout
-from cohdc_train.slam.io.stereo import stereo_layout
-from cohdc_train.slam.runner import RunObserver, play
-from cohdc_train.slam.runtime.threads import one_thread
-from cohdc_train.slam.runtime.workers import workers
-from cohdc_train.slam.tracking.tracker import MIN_START, Tracker
+from cohdc_train.slam.io.growing_sequence import GrowingSequence
+from cohdc_train.slam.io.live import stop_on_sigint
+from cohdc_train.slam.io.results import (
+    check_output_dir,
+    compute_metrics,
+    move_into_place,
+    write_run,
+)
+from cohdc_train.slam.io.sequence import choose_format
+from cohdc_train.slam.io.sources import FrameSource, RecordedSequence
+from cohdc_train.slam.runner import RunObserver, track_sequence
+from cohdc_train.slam.runtime.threads import single_threaded
+from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
+from cohdc_train.slam.system import Slam
 from cohdc_train.slam.visualization.map_files import MapFiles
-from cohdc_train.slam.visualization.rerun_viewer import Viewer
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
+from cohdc_train.slam.visualization.worst_frames import WorstFrames
+from cohdc_train.trajectory.trajectory import Trajectory
+
+# Options of earlier versions: `cohdc slam` tells their names of today.
+RENAMED_OPTIONS = {
+    "--sequence": "the first argument, cohdc slam SEQUENCE,",
+    "--seed": "--settings.seed",
+    "--features": "--settings.features.max_keypoints",
+    "--cloud": "--dense_cloud",
+    "--idle": "--idle_timeout",
+    "--view": "--viewer",
+    "--culling.dynamic_classes": "--settings.masks.dynamic_classes",
+    "--culling.score": "--settings.masks.min_score",
+    "--culling.quality": "--settings.masks.min_quality",
+    "--culling.dilate": "--settings.masks.dilation_px",
+    "--culling.doubt": "--settings.masks.quality_dilation",
+    "--method.loops": "--settings.loops.enabled",
+    "--method.refinement": "--settings.refinement.enabled",
+    "--method.geometry": "--settings.free_space.enabled",
+    "--method.static_weights": "--settings.motion_segmentation.enabled",
+    "--method.global_adjustment": "--settings.bundle_adjustment.global_enabled",
+    "--method.every_frame": "--settings.bundle_adjustment.use_all_frames",
+    "--method.smoothing": "--settings.smoothing.enabled",
+    "--method.keyframe_culling": "--settings.keyframe_culling.enabled",
+    "--method.flow": "--settings.flow.enabled",
+}
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a run, beside its input and the settings of the SLAM system.
+
+    Args:
+        camera: camera YAML; else camera.yaml of the sequence, else a guess from the folder's name.
+        realtime: take frames at the pace of their timestamps, and drop delayed ones; masks and
+            mapping run in parallel with tracking. Results then depend on the machine.
+        dense_cloud: write cloud.ply too, the dense colored points of all static surfaces.
+        follow: the sequence is still being written: take frames as its lists grow.
+        idle_timeout: seconds without a new frame after which a followed sequence has ended; a file
+            named done in its folder ends it, too.
+        viewer: show the run in rerun's window; needs `pip install 'cohdc-train[view]'`.
+        rrd: file to record the same for rerun.
+    """
+
+    camera: Path | None = None
+    realtime: bool = False
+    dense_cloud: bool = False
+    follow: bool = False
+    idle_timeout: float = 10.0
+    viewer: bool = False
+    rrd: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.idle_timeout < float("inf"):
+            raise DataError(f"idle_timeout is {self.idle_timeout:g}; allowed: above 0")
 
 
 def slam(
-    *,
     sequence: Path,
+    *,
     out: Path,
     model: Path | None = None,
     masks: Path | None = None,
-    camera: Path | None = None,
-    seed: int = 0,
-    features: int = MAX_KEYPOINTS,
-    culling: Culling = Culling(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
-    method: Method = Method(),  # noqa: B008 - the same
-    realtime: bool = False,
-    cloud: bool = False,
-    follow: bool = False,
-    idle: float = 10.0,
-    view: bool = False,
-    rrd: Path | None = None,
+    settings: SlamConfig = SlamConfig(),
+    **options: Any,
 ) -> dict[str, Any]:
-    """Track an RGB-D camera or a stereo pair through a TUM-format sequence, people removed by masks
-    or a model.
+    """Track an RGB-D camera or a stereo pair through a TUM-format sequence with moving people.
 
-    Writes trajectory.txt (TUM format, every tracked frame), metrics.json, frames.csv, config.yaml,
-    map.ply, map.png and pictures/ into the output folder, and returns the metrics. Raises
-    DataError, naming file and line, for input that cannot be used.
+    People are excluded by masks or a model. Writes trajectory.txt (TUM format, every tracked
+    frame), metrics.json, frames.csv, config.yaml, map.ply, map.png, and pictures/ into the output
+    folder, and returns the metrics. `--config RUN/config.yaml` repeats a run.
 
     Args:
-        sequence: folder with rgb.txt, depth.txt and their images, or left.txt and right.txt of a
-            rectified stereo pair whose camera yaml has a baseline; groundtruth.txt is used for
-            scores when there.
-        out: folder for the results. Files of a former run are replaced and all others stay. A
-            folder that holds other files with the names of results is refused.
-        model: ONNX written by `cohdc export`, or a shipped network's name (person, person_s); every
-            frame is segmented.
-        masks: folder of PNGs with the names of the colour images, above 0 = dynamic.
-        camera: camera yaml; else camera.yaml of the sequence, else a guess from the folder's name.
-        seed: of the random samples; the same seed gives the same numbers.
-        features: corners per frame.
-        culling: how masks are made.
-        method: which parts of the method run.
-        realtime: frames come at the pace of their stamps, one that is late is dropped and counted;
-            masks and mapping are made beside tracking. Then the numbers depend on the machine.
-        cloud: write cloud.ply too, the dense coloured points of all that stands still.
-        follow: the sequence is still being written: take frames as its lists grow.
-        idle: s without a new frame after which a followed sequence has ended; a file named done
-            there ends it, too.
-        view: show the run in rerun's window while it goes; needs `pip install 'cohdc-train[view]'`.
-        rrd: file to record the same for rerun, to be looked at later.
+        sequence: folder with rgb.txt, depth.txt, and their images, or with left.txt and right.txt
+            of a rectified stereo pair whose camera YAML has a baseline; groundtruth.txt is used for
+            scores.
+        out: folder for the results. Files of a former run are replaced, all others stay. A folder
+            that holds other files with the names of results is refused.
+        model: ONNX file written by `cohdc export`, or a shipped network's name (person, person_s),
+            which segments every frame.
+        masks: folder of PNG masks with the names of the color images, above 0 = dynamic.
+        settings: options of the SLAM system.
+        options: as RunOptions.
     """
-    _check_options(out, cloud, model, masks, seed, features)
-    source, origin = _source(sequence, camera, follow, idle)
-    return run_source(
-        source,
-        out=out,
+    return run_slam(
+        sequence,
+        out,
         model=model,
         masks=masks,
-        seed=seed,
-        features=features,
-        culling=culling,
-        method=method,
-        realtime=realtime,
-        cloud=cloud,
-        view=view,
-        rrd=rrd,
-        origin=origin,
+        settings=settings,
+        options=RunOptions(**options),
     )
 
 
-def run_source(
-    source: Source,
-    *,
+def run_slam(
+    source: FrameSource | Path,
     out: Path,
+    *,
     model: Path | None = None,
     masks: Path | None = None,
-    seed: int = 0,
-    features: int = MAX_KEYPOINTS,
-    culling: Culling | None = None,
-    method: Method | None = None,
-    realtime: bool = False,
-    cloud: bool = False,
-    view: bool = False,
-    rrd: Path | None = None,
+    settings: SlamConfig = SlamConfig(),
+    options: RunOptions = RunOptions(),
     observers: Sequence[RunObserver] = (),
     on_pose: PoseCallback | None = None,
-    origin: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """`slam` of any source of views, a camera of one's own for instance; the same files, metrics
-    and errors. One run at a time in a process (`one_thread`).
+    """Track a sequence or a camera, write the results into a folder, and return the metrics.
 
-    on_pose: called with every frame's pose as soon as it is known; watchers: when what the frame
-    adds to the map has been done as well, in real time up to a frame's time later; origin: words
-    about the source for config.yaml. Raises DataError when no frame comes.
+    One run at a time in a process, for it limits the threads of numerical libraries.
+
+    Args:
+        source: folder of a sequence as `cohdc slam` takes it, or frames, such as LiveCamera.
+        out: folder for the results, as `cohdc slam` writes them.
+        model: ONNX file or shipped network that segments every frame; not together with masks.
+        masks: folder of PNG masks.
+        settings: options of the SLAM system.
+        options: real time, outputs, and how a folder is read.
+        observers: called after all work on a frame; in real time up to a frame period later.
+        on_pose: called with each frame's result as soon as its pose is known.
+
+    Raises:
+        DataError: the input cannot be used, or no frame comes; one line that names file and number.
     """
-    _check_options(out, cloud, model, masks, seed, features)
-    culling, method = culling or Culling(), method or Method()
-    truth = None if source.groundtruth is None else read_tum(source.groundtruth)
-    maker = _masks(model, masks, source.camera, culling, 1 if realtime else 0)
-    options = {
-        "model": model,
-        "masks": masks,
-        "seed": seed,
-        "features": features,
-        "realtime": realtime,
-    }
-    config: dict[str, Any] = {
-        key: str(v) if isinstance(v, Path) else v for key, v in options.items()
-    }
-    config |= {
-        "culling": asdict(culling),
-        "method": asdict(method),
-        "camera": source.camera.as_dict(),
-    }
-    config |= {**(origin or {}), "version": __version__}
+    if model is not None and masks is not None:
+        raise DataError("give --model or --masks, not both")
+    check_output_dir(out, options.dense_cloud)
+    sequence = source if isinstance(source, Path) else None
+    if isinstance(source, Path):
+        source = _open_folder(source, settings, options)
+    truth = None if source.groundtruth is None else Trajectory.load_tum(source.groundtruth)
+    make_masks = _mask_source(model, masks, source.camera, settings, options.realtime)
     with (
-        one_thread(),
+        single_threaded(),
         tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder,
     ):
         part = Path(folder)
         with ExitStack() as stack:
-            beside = stack.enter_context(workers(source, maker)) if realtime else None
-            in_time = (beside.executor, beside.source.spent) if beside else ()
-            tracker = Tracker(source.camera, features, seed, method, *in_time)
-            files = stack.enter_context(MapFiles(source.camera, part, cloud))
-            observers = [files, *observers]
-            if view or rrd is not None:
-                observers.append(stack.enter_context(Viewer(source.camera, view, rrd)))
-            stack.enter_context(stopped_by_ctrl_c(source))
-            views, mask_of = (
-                (beside.source, beside.mask_of) if beside else (source, maker or no_masks)
+            workers = None
+            if options.realtime:
+                workers = stack.enter_context(
+                    start_workers(source, make_masks, settings.masks, settings.realtime)
+                )
+            slam_system = _build_slam(source.camera, settings, workers)
+            files = stack.enter_context(_map_files(source.camera, part, settings, options))
+            worst_frames = WorstFrames()
+            watching: list[RunObserver] = [files, worst_frames, *observers]
+            if options.viewer or options.rrd is not None:
+                viewer = RerunViewer(source.camera, files.colors, options.viewer, options.rrd)
+                watching.append(stack.enter_context(viewer))
+            stack.enter_context(stop_on_sigint(source))
+            tracked = track_sequence(
+                slam_system,
+                workers.source if workers else source,
+                workers.mask_of if workers else make_masks or no_masks,
+                part / "pictures",
+                watching,
+                workers.report_latency(on_pose) if workers else on_pose,
             )
-            answer = beside.answering(on_pose) if beside else on_pose
-            records = play(tracker, views, mask_of, part / "pictures", observers, answer)
-            files.write(tracker)
-        trajectory = Trajectory(*tracker.trajectory())
-        metrics = {
-            "seed": seed,
-            "realtime": realtime,
-            "loops": tracker.loops,
-            "without_depth": source.without_depth,
+            files.write(slam_system.map, tracked.trajectory)
+            worst_frames.write(part / "pictures")
+        metrics: dict[str, Any] = {
+            "seed": settings.seed,
+            "realtime": options.realtime,
+            "loops": slam_system.num_loops,
+            "without_depth": source.num_unpaired,
+            "keyframes_in_map": len(slam_system.map.keyframes),
         }
-        metrics["keyframes_in_map"] = len(tracker.map.keyframes)
-        metrics |= measure(records, trajectory, truth, beside.source.dropped if beside else 0)
-        metrics |= beside.metrics() if beside else {}
-        write_run(part, records, trajectory, metrics, config)
-        publish_run(part, out)
+        dropped = workers.source.dropped if workers else 0
+        metrics |= compute_metrics(tracked.records, tracked.trajectory, truth, dropped)
+        if workers is not None:
+            # Masks are propagated to each frame; the segmenter's own time is segmenter_ms.
+            stages = metrics["ms"].items()
+            metrics["ms"] = {"mask" if k == "segment" else k: v for k, v in stages}
+            metrics |= workers.metrics()
+        inputs = {"sequence": sequence, "model": model, "masks": masks}
+        config = _config_text(inputs, source.camera, settings, options)
+        write_run(part, tracked.records, tracked.trajectory, metrics, config)
+        move_into_place(part, out)
     print(f"{summary(metrics)}\nwritten to {out}")
     return metrics
 
 
 def summary(metrics: dict[str, Any]) -> str:
-    """The small table at the end of a run."""
+    """Return the small table at the end of a run."""
+    tracked = f"{metrics['tracked']} of {metrics['frames']} tracked"
+    in_map = f"{metrics['keyframes_in_map']} of them in the map at the end"
     rows = [
-        (
-            "frames",
-            f"{metrics['tracked']} of {metrics['frames']} tracked ({100 * metrics['coverage']:.1f} %)",
-        ),
-        (
-            "keyframes",
-            f"{metrics['keyframes']}, {metrics['keyframes_in_map']} of them in the map at the end",
-        ),
+        ("frames", f"{tracked} ({100 * metrics['coverage']:.1f} %)"),
+        ("keyframes", f"{metrics['keyframes']}, {in_map}"),
         ("loops closed", str(metrics["loops"])),
         ("frames/s", f"{metrics['fps']:.1f}"),
     ]
@@ -202,62 +235,65 @@ def summary(metrics: dict[str, Any]) -> str:
     rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
     for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
         if key in metrics:
-            rows.append(
-                (key, "  ".join(f"{name} {value:.4f}" for name, value in metrics[key].items()))
-            )
+            values = [f"{name} {value:.4f}" for name, value in metrics[key].items()]
+            rows.append((key, "  ".join(values)))
     return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
-def _check_options(
-    out: Path,
-    cloud: bool,
-    model: Path | None,
-    masks: Path | None,
-    seed: int,
-    features: int,
-) -> None:
-    if model is not None and masks is not None:
-        raise DataError("give --model or --masks, not both")
-    if seed < 0:
-        raise DataError(f"seed is {seed}; it cannot be below 0")
-    if features < MIN_START:
-        raise DataError(f"features is {features}; a map cannot start with fewer than {MIN_START}")
-    check_out(out, cloud)
-
-
-def _source(
-    sequence: Path, camera: Path | None, follow: bool, idle: float
-) -> tuple[Source, dict[str, str]]:
-    """The frames of a folder, and what config.yaml says of where they come from."""
-    if not sequence.is_dir():
-        raise DataError(f"{sequence}: no such folder")
-    intrinsics, origin = choose_camera(sequence, camera)
+def _open_folder(folder: Path, settings: SlamConfig, options: RunOptions) -> FrameSource:
+    """Open the folder of a sequence, and say what is read."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder")
+    camera, origin = choose_camera(folder, options.camera)
     print(f"camera: {origin}")
-    words = {"sequence": str(sequence), "camera_origin": origin}
-    stereo = (sequence / "left.txt").is_file() or (
-        intrinsics.baseline > 0 and not (sequence / "rgb.txt").is_file()
-    )
-    layout = stereo_layout(intrinsics) if stereo else rgbd_layout(intrinsics)
-    if follow:
-        print(
-            f"sequence: {layout.first} and {layout.second} as they grow; a file {sequence / 'done'} or Ctrl-C ends it"
-        )
-        return Followed(sequence, intrinsics, layout, idle), words
-    source = Recorded(sequence, intrinsics, layout)
-    print(
-        f"sequence: {len(source)} pairs; {source.without_depth} images have no partner and are left out"
-    )
-    return source, words
+    form = choose_format(folder, camera, settings.stereo)
+    if options.follow:
+        end = f"a file {folder / 'done'} or Ctrl-C ends it"
+        print(f"sequence: {form.first} and {form.second} as they grow; {end}")
+        return GrowingSequence(folder, camera, form, options.idle_timeout)
+    source = RecordedSequence(folder, camera, form)
+    skipped = f"{source.num_unpaired} images without a partner are skipped"
+    print(f"sequence: {len(source)} pairs; {skipped}")
+    return source
 
 
-def _masks(
-    model: Path | None, masks: Path | None, camera: Camera, culling: Culling, threads: int
+def _mask_source(
+    model: Path | None, masks: Path | None, camera: Camera, settings: SlamConfig, realtime: bool
 ) -> MaskFolder | SegmenterMasks | None:
-    """threads: of the segmenter, 0 = as many as there are cores."""
+    """Return the source of masks; in real time the segmenter runs on one thread."""
     if masks is not None:
-        return MaskFolder(masks, camera, culling)
+        return MaskFolder(masks, camera, settings.masks)
     if model is None:
         return None
     from cohdc_train.segmenter import Segmenter
 
-    return SegmenterMasks(Segmenter(model, threads), culling)
+    return SegmenterMasks(Segmenter(model, 1 if realtime else 0), settings.masks)
+
+
+def _map_files(camera: Camera, folder: Path, settings: SlamConfig, options: RunOptions) -> MapFiles:
+    """Return the recorder of the map's files."""
+    max_depth_m = settings.depth.limit_m(camera.baseline)
+    return MapFiles(camera, folder, options.dense_cloud, max_depth_m, settings.dense_cloud)
+
+
+def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers | None) -> Slam:
+    """Build the SLAM system, in real time with the workers."""
+    if workers is None:
+        return Slam(camera, settings)
+    return Slam(
+        camera,
+        settings,
+        executor=workers.executor,
+        frame_time_used=workers.source.frame_time_used,
+    )
+
+
+def _config_text(
+    inputs: dict[str, Path | None], camera: Camera, settings: SlamConfig, options: RunOptions
+) -> str:
+    """Return config.yaml, which `cohdc slam --config` reads; version and camera are comments."""
+    content = {name: None if path is None else str(path) for name, path in inputs.items()}
+    content |= as_plain(asdict(options)) | {"settings": as_plain(asdict(settings))}
+    intrinsics = " ".join(f"{name}={value:g}" for name, value in camera.as_dict().items())
+    head = f"# cohdc {__version__}\n# camera: {intrinsics}\n"
+    return head + yaml.safe_dump(content, sort_keys=False)

@@ -1,12 +1,19 @@
-"""Things that people use: a chair to sit on, a loaded cart to push. Own frame as a person's: x
-forward, z up, m.
+"""Furniture that people use: a chair, and a loaded cart to push.
+
+Own frame as a person's: x forward, z up, m.
 """
 
 import numpy as np
 
 from cohdc_train.synth import mesh as solids
 from cohdc_train.synth.mesh import Mesh
-from cohdc_train.synth.textures import Texture, carton, letters, poster, wood
+from cohdc_train.synth.textures import (
+    Texture,
+    carton_texture,
+    poster_texture,
+    wood_texture,
+    write_letters,
+)
 
 HANDLE = -0.47  # m: where along x a cart's handle stands
 _SIDE = 256  # px of a texture
@@ -14,7 +21,7 @@ _UPRIGHT = (0.0, 1.0, 0.0)
 
 
 def chair(seat: float) -> Mesh:
-    """A chair whose seat is `seat` m above the floor, its only texture number 0."""
+    """Return a chair whose seat is `seat` m above the floor; its only texture is number 0."""
     parts = [
         solids.box((0.12, 0, seat - 0.02), (0.44, 0.46, 0.04), 0, 0, 0),
         solids.box((-0.17, 0, seat + 0.33), (0.03, 0.44, 0.3), 0, 0, 0),
@@ -22,23 +29,21 @@ def chair(seat: float) -> Mesh:
     for y in (-0.2, 0.2):
         parts.append(solids.box((0.31, y, seat / 2 - 0.02), (0.035, 0.035, seat - 0.04), 0, 0, 0))
         parts.append(solids.box((-0.17, y, seat / 2 + 0.14), (0.035, 0.035, seat + 0.28), 0, 0, 0))
-    return solids.join(parts)
+    return solids.join_meshes(parts)
 
 
 def chair_texture(rng: np.random.Generator) -> Texture:
-    """What a chair is made of."""
-    return wood(rng, _SIDE, _SIDE)
+    """Draw the texture of a chair."""
+    return wood_texture(rng, _SIDE, _SIDE)
 
 
 def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
-    """A cart of 1 x .6 m with a handle at its back, loaded to a height of 1.2-1.5 m, and its
-    textures.
-    """
+    """Draw a cart of 1 x .6 m with a handle at its back, loaded to 1.2-1.5 m, and its textures."""
     looks = (
         _metal(rng),
-        carton(rng, _SIDE, _SIDE),
-        poster(rng, _SIDE, _SIDE),
-        carton(rng, _SIDE, _SIDE),
+        carton_texture(rng, _SIDE, _SIDE),
+        poster_texture(rng, _SIDE, _SIDE),
+        carton_texture(rng, _SIDE, _SIDE),
     )
     parts = [solids.box((0, 0, 0.2), (1.0, 0.6, 0.05), 0, 0, 0)]
     for x in (-0.4, 0.4):
@@ -62,11 +67,11 @@ def cart(rng: np.random.Generator) -> tuple[Mesh, tuple[Texture, ...]]:
             (-0.2, 0.05, 0.225 + low + 0.11), (0.3, 0.34, 0.22), float(rng.normal(0, 0.1)), 3, 1
         )
     )
-    return solids.join(parts), looks
+    return solids.join_meshes(parts), looks
 
 
 def _metal(rng: np.random.Generator) -> Texture:
-    """Painted metal with a label."""
+    """Draw painted metal with a label."""
     image = np.full((_SIDE, _SIDE, 3), rng.uniform(60, 190), dtype=np.float32)
-    letters(image, rng, 2)
+    write_letters(image, rng, 2)
     return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)

@@ -7,12 +7,12 @@ rad.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.synth import clothes
 from cohdc_train.synth import mesh as solids
 from cohdc_train.synth.mesh import Mesh
 from cohdc_train.synth.textures import Texture
+from cohdc_train.types import Float32Array
 
 SHIRT, TROUSERS, SKIN, FACE, HAIR, SHOES = range(6)  # order of a person's textures
 LEFT = (0.0, 1.0, 0.0)
@@ -21,11 +21,16 @@ _THIGH, _SHANK, _UPPER_ARM, _FOREARM = 0.245, 0.245, 0.17, 0.15  # as parts of t
 
 @dataclass(frozen=True)
 class Person:
-    """A body and what it wears.
+    """A body and its clothes.
 
-    height: m; girth: 1 = slim adult; bare_arms, legwear (`trousers | shorts | skirt`), hairstyle
-    (`short | long | none`), coat: length the shirt hangs below the waist, as part of the height;
-    textures: six, in the order SHIRT TROUSERS SKIN FACE HAIR SHOES.
+    Attributes:
+        height: m.
+        girth: 1 = slim adult.
+        bare_arms: the shirt has short sleeves.
+        legwear: `trousers`, `shorts` or `skirt`.
+        hairstyle: `short`, `long` or `none`.
+        coat: length the shirt hangs below the waist, as part of the height.
+        textures: six, in the order SHIRT TROUSERS SKIN FACE HAIR SHOES.
     """
 
     height: float
@@ -38,7 +43,7 @@ class Person:
 
 
 @dataclass(frozen=True)
-class Pose:
+class BodyPose:
     """Joint angles, rad; pairs are (left, right). Forward swings are positive; bends are >= 0."""
 
     hips: tuple[float, float]
@@ -51,8 +56,11 @@ class Pose:
 
 
 def draw_person(rng: np.random.Generator, patterned: float = 0.6) -> Person:
-    """A random adult or teenager with clothes; `patterned` is the chance of a shirt with a pattern."""
-    tone, hair = clothes.skin_tone(rng), clothes.hair_colour(rng)
+    """Draw an adult or teenager with clothes.
+
+    patterned: probability of a shirt with a pattern.
+    """
+    tone, hair = clothes.skin_tone(rng), clothes.hair_color(rng)
     looks = (
         clothes.cloth(rng, patterned),
         clothes.cloth(rng, patterned / 2),
@@ -73,31 +81,37 @@ def draw_person(rng: np.random.Generator, patterned: float = 0.6) -> Person:
 
 
 def stride(person: Person) -> float:
-    """Metres walked in one cycle of two steps."""
+    """Return the meters walked in one cycle of two steps."""
     return 0.8 * person.height
 
 
-def walking(phase: float, vigour: float = 1.0) -> Pose:
-    """The walk cycle at `phase` rad (2 pi = two steps); vigour 0 stands still, 1 walks."""
+def walking(phase: float, vigor: float = 1.0) -> BodyPose:
+    """Return the pose at `phase` rad of the walk cycle, of which 2 pi are two steps.
+
+    vigor: 0 stands, 1 walks.
+    """
     s, c = np.sin(phase), np.cos(phase)
-    swing = 0.46 * vigour
-    lift = 0.85 * vigour
-    return Pose(
-        hips=(swing * s + 0.04 * vigour, -swing * s + 0.04 * vigour),
+    swing = 0.46 * vigor
+    lift = 0.85 * vigor
+    return BodyPose(
+        hips=(swing * s + 0.04 * vigor, -swing * s + 0.04 * vigor),
         knees=(0.06 + lift * max(c, 0.0) ** 1.5, 0.06 + lift * max(-c, 0.0) ** 1.5),
-        shoulders=(-0.5 * vigour * s, 0.5 * vigour * s),
-        elbows=(0.18 + 0.25 * vigour * (1 - s), 0.18 + 0.25 * vigour * (1 + s)),
+        shoulders=(-0.5 * vigor * s, 0.5 * vigor * s),
+        elbows=(0.18 + 0.25 * vigor * (1 - s), 0.18 + 0.25 * vigor * (1 + s)),
         spread=(0.12, 0.12),
-        lean=0.05 * vigour + 0.01,
+        lean=0.05 * vigor + 0.01,
         nod=0.0,
     )
 
 
-def sitting(fidget: float, gesture: float) -> Pose:
-    """Seated, a hand on each thigh; fidget -1..1 sways trunk and head a little, gesture 0..1 lifts
-    the right hand.
+def sitting(fidget: float, gesture: float) -> BodyPose:
+    """Return a seated pose with a hand on each thigh.
+
+    Args:
+        fidget: -1..1, sways trunk and head a little.
+        gesture: 0..1, lifts the right hand.
     """
-    return Pose(
+    return BodyPose(
         hips=(1.45, 1.5),
         knees=(1.5, 1.45),
         shoulders=(0.42, 0.42 + 0.5 * gesture),
@@ -108,8 +122,8 @@ def sitting(fidget: float, gesture: float) -> Pose:
     )
 
 
-def seat_height(person: Person, pose: Pose) -> float:
-    """Height above the floor of what a seated person's thighs rest on, m."""
+def seat_height(person: Person, pose: BodyPose) -> float:
+    """Return the height above the floor at which a seated person's thighs rest, m."""
     soles = [
         _leg(person, side, hip, knee)[1]
         for side, hip, knee in zip((1, -1), pose.hips, pose.knees, strict=True)
@@ -117,8 +131,8 @@ def seat_height(person: Person, pose: Pose) -> float:
     return -min(soles) - 0.05 * person.height * person.girth
 
 
-def draw_pose(rng: np.random.Generator) -> Pose:
-    """A random moment: half of them walking, the others standing, gesturing or reaching."""
+def draw_pose(rng: np.random.Generator) -> BodyPose:
+    """Draw a pose: half of them walk, the others stand, gesture or reach."""
     kind = rng.random()
     pose = walking(
         float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.5, 1.2)) if kind < 0.55 else 0.1
@@ -130,7 +144,7 @@ def draw_pose(rng: np.random.Generator) -> Pose:
     if rng.random() < 0.4:
         left, bends = pose.shoulders[0], (pose.elbows[0], bends[1])
     spread = (float(rng.uniform(0.05, 0.9)), float(rng.uniform(0.05, 0.9)))
-    return Pose(
+    return BodyPose(
         pose.hips,
         pose.knees,
         (left, right),
@@ -141,19 +155,31 @@ def draw_pose(rng: np.random.Generator) -> Pose:
     )
 
 
-def _direction(swing: float, spread: float) -> NDArray[np.float32]:
-    """[3] where a limb points: `swing` forward of straight down, `spread` (signed) towards y."""
+def _direction(swing: float, spread: float) -> Float32Array:
+    """Return the direction of a limb, [3].
+
+    Args:
+        swing: forward of straight down, rad.
+        spread: toward y, rad, signed.
+    """
     return np.array(
         [np.sin(swing) * np.cos(spread), np.sin(spread), -np.cos(swing) * np.cos(spread)],
         dtype=np.float32,
     )
 
 
-def person_mesh(person: Person, pose: Pose, position: tuple[float, float], heading: float) -> Mesh:
-    """The person standing on the floor at `position` (x, y) m, looking along `heading` rad, as
-    instance 0.
+def person_mesh(
+    person: Person, pose: BodyPose, position: tuple[float, float], heading: float
+) -> Mesh:
+    """Return the person standing on the floor, as instance 0.
 
     Texture numbers are 0..5 in the order of `Person.textures`.
+
+    Args:
+        person: the body.
+        pose: joint angles.
+        position: (x, y), m.
+        heading: viewing direction, rad.
     """
     parts: list[Mesh] = []
     lowest = 0.0
@@ -167,12 +193,12 @@ def person_mesh(person: Person, pose: Pose, position: tuple[float, float], headi
         (1, -1), pose.shoulders, pose.elbows, pose.spread, strict=True
     ):
         parts += _arm(person, spine, side, (swing, bend, spread))
-    body = solids.join(parts)
-    return body.moved(solids.yaw_rotation(heading), (position[0], position[1], -lowest))
+    body = solids.join_meshes(parts)
+    return body.transformed(solids.yaw_rotation(heading), (position[0], position[1], -lowest))
 
 
 def _leg(person: Person, side: int, hip: float, knee: float) -> tuple[list[Mesh], float]:
-    """Thigh, shank and foot below hips at z = 0, and the z of the sole."""
+    """Return thigh, shank and foot below hips at z = 0, and the z of the sole."""
     h, g = person.height, person.height * person.girth
     top = np.array([0, side * 0.052 * g, 0], dtype=np.float32)
     middle = top + _THIGH * h * _direction(hip, side * 0.03)
@@ -198,8 +224,8 @@ def _leg(person: Person, side: int, hip: float, knee: float) -> tuple[list[Mesh]
     return parts, float(min(heel[2], toe[2]) - 0.024 * h)
 
 
-def _trunk(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
-    """Pelvis (or skirt), chest up to the neck."""
+def _trunk(person: Person, pose: BodyPose, spine: Float32Array) -> list[Mesh]:
+    """Return the pelvis (or skirt), and the chest up to the neck."""
     h, g = person.height, person.height * person.girth
     up = np.array([0, 0, 1], dtype=np.float32)
     belly = 1 + 1.2 * (person.girth - 1)
@@ -223,41 +249,41 @@ def _trunk(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]
             np.array([0.04, -0.02, -0.12, -0.22]),
             np.array([0.09, 0.108, 0.12 + reach / 2, 0.13 + reach]),
         )
-    centres = (fall[:, None] * up * h).astype(np.float32)
+    centers = (fall[:, None] * up * h).astype(np.float32)
     parts.append(
         solids.tube(
-            centres, np.stack([width, width * 0.78], 1).astype(np.float32) * g, LEFT, TROUSERS, 16
+            centers, np.stack([width, width * 0.78], 1).astype(np.float32) * g, LEFT, TROUSERS, 16
         )
     )
     return parts
 
 
-def _head(person: Person, pose: Pose, spine: NDArray[np.float32]) -> list[Mesh]:
-    """Neck, head with its face forward, hair."""
+def _head(person: Person, pose: BodyPose, spine: Float32Array) -> list[Mesh]:
+    """Return the neck, the head with its face forward, and the hair."""
     h = person.height
     neck = 0.305 * h * spine
     tilt = np.array(
         [np.sin(pose.lean * 0.3 + pose.nod), 0, np.cos(pose.lean * 0.3 + pose.nod)],
         dtype=np.float32,
     )
-    centre = neck + 0.105 * h * tilt
+    center = neck + 0.105 * h * tilt
     parts = [
-        solids.capsule(neck - 0.02 * h * spine, centre, (0.032 * h, 0.03 * h), LEFT, SKIN),
-        solids.ellipsoid(centre, (0.056 * h, 0.045 * h, 0.068 * h), FACE),
+        solids.capsule(neck - 0.02 * h * spine, center, (0.032 * h, 0.03 * h), LEFT, SKIN),
+        solids.ellipsoid(center, (0.056 * h, 0.045 * h, 0.068 * h), FACE),
     ]
     if person.hairstyle != "none":
         back = np.array([-0.017 * h, 0, 0.017 * h], dtype=np.float32)
-        parts.append(solids.ellipsoid(centre + back, (0.055 * h, 0.05 * h, 0.066 * h), HAIR))
+        parts.append(solids.ellipsoid(center + back, (0.055 * h, 0.05 * h, 0.066 * h), HAIR))
     if person.hairstyle == "long":
         hanging = np.array([-0.036 * h, 0, -0.045 * h], dtype=np.float32)
-        parts.append(solids.ellipsoid(centre + hanging, (0.035 * h, 0.052 * h, 0.085 * h), HAIR))
+        parts.append(solids.ellipsoid(center + hanging, (0.035 * h, 0.052 * h, 0.085 * h), HAIR))
     return parts
 
 
 def _arm(
-    person: Person, spine: NDArray[np.float32], side: int, angles: tuple[float, float, float]
+    person: Person, spine: Float32Array, side: int, angles: tuple[float, float, float]
 ) -> list[Mesh]:
-    """Upper arm, forearm and hand; angles: (swing, bend, spread)."""
+    """Return upper arm, forearm and hand. angles: (swing, bend, spread), rad."""
     h, g = person.height, person.height * person.girth
     swing, bend, spread = angles
     shoulder = 0.272 * h * spine + np.array([0, side * 0.108 * g, 0], dtype=np.float32)

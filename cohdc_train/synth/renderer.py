@@ -1,6 +1,4 @@
-"""Ray casting (Embree) of textured triangles: colour, exact depth and instance numbers of every
-pixel.
-"""
+"""Cast rays (Embree) at textured triangles: color, exact depth and instance of every pixel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,16 +6,16 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cohdc_train.synth.mesh import Floats, Mesh
+from cohdc_train.synth.mesh import Mesh
 from cohdc_train.synth.room import Lighting
 from cohdc_train.synth.textures import Texture
+from cohdc_train.types import Float32Array, FloatArray, Int32Array
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A pinhole camera; px. Whole numbers are pixel centres, as in TUM's intrinsics."""
+class RenderCamera:
+    """Pinhole camera; px. Whole numbers are pixel centers, as in TUM's intrinsics."""
 
     fx: float
     fy: float
@@ -27,8 +25,8 @@ class Camera:
     height: int
 
     @classmethod
-    def freiburg3(cls, size: tuple[int, int]) -> "Camera":
-        """TUM's freiburg3 camera (640 x 480) scaled to `size` (height, width)."""
+    def freiburg3(cls, size: tuple[int, int]) -> "RenderCamera":
+        """Return TUM's freiburg3 camera (640 x 480), scaled to `size` (height, width)."""
         sy, sx = size[0] / 480, size[1] / 640
         return cls(
             535.4 * sx,
@@ -39,9 +37,9 @@ class Camera:
             size[0],
         )
 
-    def resized(self, factor: float) -> "Camera":
-        """The same view with `factor` times as many pixels a side."""
-        return Camera(
+    def resized(self, factor: float) -> "RenderCamera":
+        """Return the camera of the same view with `factor` times as many pixels a side."""
+        return RenderCamera(
             self.fx * factor,
             self.fy * factor,
             (self.cx + 0.5) * factor - 0.5,
@@ -53,38 +51,45 @@ class Camera:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the N rays of a view meet. triangle: [N] int32, -1 = nothing; weights: [N, 2]
-    barycentric; depth: [N] m;
-    directions: [N, 3] world frame."""
+    """First triangles that the N rays of a view meet.
 
-    triangle: NDArray[np.int32]
-    weights: Floats
-    depth: Floats
-    directions: Floats
+    Attributes:
+        triangle: [N] int32, -1 = nothing.
+        weights: [N, 2] barycentric.
+        depth: [N] m.
+        directions: [N, 3] world frame.
+    """
+
+    triangle: Int32Array
+    weights: Float32Array
+    depth: Float32Array
+    directions: Float32Array
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """A rendered frame.
 
-    rgb: [H, W, 3] float32 >= 0, light before exposure; depth: [H, W] m along the optical axis, 0 =
-    nothing;
-    instance: [H, W] int32, 0 = room; facing: [H, W] cosine between the ray and the surface normal.
+    Attributes:
+        rgb: [H, W, 3] float32 >= 0, light before exposure.
+        depth: [H, W] m along the optical axis, 0 = nothing.
+        instance: [H, W] int32, 0 = room.
+        facing: [H, W] cosine between the ray and the surface normal.
     """
 
-    rgb: Floats
-    depth: Floats
-    instance: NDArray[np.int32]
-    facing: Floats
+    rgb: Float32Array
+    depth: Float32Array
+    instance: Int32Array
+    facing: Float32Array
 
 
 class Atlas:
-    """All textures with their reduced copies in one image, so that one remap colours a frame."""
+    """All textures and their reduced copies in one image, so that one remap colors a frame."""
 
     _WIDTH = 4096
 
     def __init__(self, textures: Sequence[Texture]) -> None:
-        """textures: [h, w, 3] uint8, sides powers of two of at most 2048."""
+        """Lay out textures [h, w, 3] uint8, whose sides are powers of two of at most 2048."""
         order = sorted(range(len(textures)), key=lambda k: -textures[k].shape[0])
         places: dict[int, tuple[int, int]] = {}
         x = y = shelf = 0
@@ -116,10 +121,15 @@ class Atlas:
             ).astype(np.uint8)
 
     def sample(
-        self, texture: NDArray[np.int32], uv: Floats, footprint: Floats, columns: int
-    ) -> Floats:
-        """[N, 3] float32 0..1 colours. uv: [N, 2]; footprint: [N] texels of the full texture a
-        pixel covers.
+        self, texture: Int32Array, uv: Float32Array, footprint: Float32Array, columns: int
+    ) -> Float32Array:
+        """Return the colors of N pixels, [N, 3] float32 in 0..1.
+
+        Args:
+            texture: [N] numbers.
+            uv: [N, 2] in 0..1.
+            footprint: [N] texels of the full texture that a pixel covers.
+            columns: width of the image, px.
         """
         level = np.rint(np.log2(np.maximum(footprint, 1))).astype(np.int32)
         level = np.minimum(level, self.levels[texture] - 1)
@@ -131,17 +141,15 @@ class Atlas:
 
 
 @lru_cache(maxsize=4)
-def rays(camera: Camera) -> Floats:
-    """[H * W, 3] directions in the camera frame with z = 1, so that a ray's length parameter is the
-    depth.
-    """
+def rays(camera: RenderCamera) -> Float32Array:
+    """Return directions [H * W, 3] in the camera frame with z = 1: the parameter is the depth."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
 
 
-def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
-    """First hits of all rays of `camera` at `T_wc` [4, 4] (camera to world, m)."""
+def cast_rays(mesh: Mesh, camera: RenderCamera, T_wc: FloatArray) -> Hits:
+    """Return the first hits of all rays of `camera` at `T_wc` [4, 4] (camera to world, m)."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -155,67 +163,78 @@ def cast(mesh: Mesh, camera: Camera, T_wc: NDArray[np.float64]) -> Hits:
 
 
 def render(
-    mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: Camera, T_wc: NDArray[np.float64]
-) -> View:
-    """Colour, depth and instances of `mesh` seen by `camera` at `T_wc` [4, 4] (camera to world, m)."""
-    hits = cast(mesh, camera, T_wc)
+    mesh: Mesh, atlas: Atlas, lighting: Lighting, camera: RenderCamera, T_wc: FloatArray
+) -> RenderedView:
+    """Render the color, depth and instances that a camera sees.
+
+    Args:
+        mesh: triangles, world frame.
+        atlas: their textures.
+        lighting: lamps and ambient light.
+        camera: intrinsics.
+        T_wc: [4, 4] camera to world, m.
+    """
+    hits = cast_rays(mesh, camera, T_wc)
     triangle = np.maximum(hits.triangle, 0)
     met = hits.triangle >= 0
     depth = np.where(met, hits.depth, 0).astype(np.float32)
-    normal = _interpolated(mesh.normals, triangle, hits.weights)
+    normal = _interpolate(mesh.normals, triangle, hits.weights)
     normal /= np.maximum(np.sqrt(_dot(normal, normal)), np.float32(1e-9))[:, None]
     lengths = np.sqrt(_dot(hits.directions, hits.directions))
-    facing: Floats = np.maximum(-_dot(normal, hits.directions) / lengths, 0)
-    uv = _interpolated(mesh.uv, triangle, hits.weights)
-    texels = _density(mesh, atlas)[triangle] / np.sqrt(np.maximum(facing, np.float32(0.1)))
-    footprint: Floats = (depth / np.float32(camera.fx) * texels).astype(np.float32, copy=False)
+    facing: Float32Array = np.maximum(-_dot(normal, hits.directions) / lengths, 0)
+    uv = _interpolate(mesh.uv, triangle, hits.weights)
+    texels = _texel_density(mesh, atlas)[triangle] / np.sqrt(np.maximum(facing, np.float32(0.1)))
+    footprint: Float32Array = (depth / np.float32(camera.fx) * texels).astype(
+        np.float32, copy=False
+    )
     albedo = atlas.sample(mesh.texture[triangle], uv, footprint, camera.width)
     position = hits.directions * depth[:, None] + T_wc[:3, 3].astype(np.float32)
-    rgb = albedo * _light(position, normal, lighting) * met[:, None]
+    rgb = albedo * _illuminate(position, normal, lighting) * met[:, None]
     shape = (camera.height, camera.width)
     instance = np.where(met, mesh.instance[triangle], 0).astype(np.int32)
-    return View(
+    return RenderedView(
         rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape), facing.reshape(shape)
     )
 
 
-def _interpolated(corners: Floats, triangle: NDArray[np.int32], weights: Floats) -> Floats:
-    """[N, C] a value given at the corners [T, 3, C], at barycentric weights of the second and third
-    corner.
+def _interpolate(
+    corners: Float32Array, triangle: Int32Array, weights: Float32Array
+) -> Float32Array:
+    """Return [N, C] values between those of the corners, [T, 3, C].
+
+    weights: [N, 2] barycentric, of the second and third corner.
     """
     first = corners[:, 0]
     second, third = corners[:, 1] - first, corners[:, 2] - first
-    value: Floats = np.take(first, triangle, axis=0)
+    value: Float32Array = np.take(first, triangle, axis=0)
     value += np.take(second, triangle, axis=0) * weights[:, :1]
     value += np.take(third, triangle, axis=0) * weights[:, 1:]
     return value
 
 
-def _density(mesh: Mesh, atlas: Atlas) -> Floats:
-    """[T] texels per metre of every triangle."""
+def _texel_density(mesh: Mesh, atlas: Atlas) -> Float32Array:
+    """Return [T] texels per meter of every triangle."""
     edges = mesh.corners[:, 1:] - mesh.corners[:, :1]
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     spans = (mesh.uv[:, 1:] - mesh.uv[:, :1]) * atlas.size[mesh.texture][:, None]
     texels = np.abs(spans[:, 0, 0] * spans[:, 1, 1] - spans[:, 0, 1] * spans[:, 1, 0])
-    density: Floats = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
+    density: Float32Array = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
     return density
 
 
-def _light(position: Floats, normal: Floats, lighting: Lighting) -> Floats:
-    """[N, 3] light that falls on every point: ambient, stronger from above, and lamps with a
-    falloff.
-    """
+def _illuminate(position: Float32Array, normal: Float32Array, lighting: Lighting) -> Float32Array:
+    """Return [N, 3] light: ambient, stronger from above, and lamps that fade with distance."""
     lamps = lighting.lamps.T
     cosine = np.maximum(normal @ lamps - _dot(normal, position)[:, None], 0)
     square = _dot(position, position)[:, None] - 2 * (position @ lamps) + (lamps * lamps).sum(0)
     square = np.maximum(square, np.float32(1e-4))
     cosine /= np.sqrt(square) * (1 + np.float32(0.12) * square)
-    total: Floats = cosine @ lighting.power
+    total: Float32Array = cosine @ lighting.power
     total += lighting.ambient * (np.float32(0.82) + np.float32(0.18) * normal[:, 2:])
     return total
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
-    """[N] row by row."""
-    product: Floats = np.einsum("ij,ij->i", a, b)
+def _dot(a: Float32Array, b: Float32Array) -> Float32Array:
+    """Return [N] dot products, row by row."""
+    product: Float32Array = np.einsum("ij,ij->i", a, b)
     return product

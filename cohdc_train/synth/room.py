@@ -1,308 +1,50 @@
-"""A furnished room: its triangles, its textures, its lamps, and where there is space to walk."""
+"""Furnished room: triangles, textures, lamps, and free floor."""
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cohdc_train.synth import mesh as solids
-from cohdc_train.synth import textures
 from cohdc_train.synth.mesh import Mesh
 from cohdc_train.synth.textures import Texture
+from cohdc_train.types import Float32Array
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """lamps: [L, 3] m; power: [L, 3] RGB; ambient: [3] RGB. World frame, z up."""
+    """Lamps and ambient light. World frame, z up.
 
-    lamps: NDArray[np.float32]
-    power: NDArray[np.float32]
-    ambient: NDArray[np.float32]
+    Attributes:
+        lamps: [L, 3] m.
+        power: [L, 3] RGB.
+        ambient: [3] RGB.
+    """
+
+    lamps: Float32Array
+    power: Float32Array
+    ambient: Float32Array
 
 
 @dataclass(frozen=True)
 class Room:
     """A room in the world frame: x in -width/2..width/2, y in 0..length, z in 0..height (up), m.
 
-    footprints: [F, 4] (x, y, half x, half y) of furniture standing on the floor.
+    Attributes:
+        size: (width, length, height), m.
+        mesh: walls and furniture.
+        textures: of the mesh.
+        lighting: lamps and ambient light.
+        footprints: [F, 4] (x, y, half x, half y) of furniture standing on the floor.
     """
 
     size: tuple[float, float, float]
     mesh: Mesh
     textures: tuple[Texture, ...]
     lighting: Lighting
-    footprints: NDArray[np.float32]
+    footprints: Float32Array
 
     def is_free(self, x: float, y: float, radius: float) -> bool:
-        """Whether a disc on the floor stays clear of walls and furniture; all in m."""
+        """Return whether a disc on the floor stays clear of walls and furniture; all in m."""
         if abs(x) > self.size[0] / 2 - radius or not radius <= y <= self.size[1] - radius:
             return False
         near = np.abs(self.footprints[:, :2] - np.array([x, y])) - self.footprints[:, 2:]
         return bool(np.all(near.max(axis=1) > radius)) if len(near) else True
-
-
-class _Builder:
-    """Collects solids, textures and footprints of one room."""
-
-    def __init__(
-        self, rng: np.random.Generator, size: tuple[float, float, float], detail: int
-    ) -> None:
-        self.rng, self.size, self.detail = rng, size, detail
-        self.parts: list[Mesh] = []
-        self.textures: list[Texture] = []
-        self.floor = 0
-        self.footprints: list[tuple[float, float, float, float]] = []
-
-    def add_texture(self, image: Texture) -> int:
-        self.textures.append(image)
-        return len(self.textures) - 1
-
-    def face(self) -> int:
-        """A new texture for a piece of furniture."""
-        maker = textures.FACES[int(self.rng.integers(len(textures.FACES)))]
-        return self.add_texture(maker(self.rng, self.detail // 4, self.detail // 4))
-
-    def shell(self, plain: bool = False) -> None:
-        """Floor, ceiling and four walls, each with a texture of its own, darker towards the
-        corners.
-
-        plain: walls of even paint, without a mark.
-        """
-        w, length, h = self.size
-        rng, d = self.rng, self.detail
-        floor = textures.FLOORS[int(rng.integers(len(textures.FLOORS)))]
-        walls = [textures.WALLS[int(k)] for k in rng.permutation(len(textures.WALLS))[:4]]
-        walls = [textures.paint] * 4 if plain else walls
-        low, high = _cornered(floor(rng, d, d)), _cornered(textures.plaster(rng, d // 2, d // 2))
-        sides = [self.add_texture(_cornered(maker(rng, d // 2, d))) for maker in walls]
-        self.floor = self.add_texture(low)
-        self.parts += [
-            solids.quad((-w / 2, length, 0), (w, 0, 0), (0, -length, 0), self.floor),
-            solids.quad((-w / 2, 0, h), (w, 0, 0), (0, length, 0), self.add_texture(high)),
-            solids.quad((-w / 2, length, h), (w, 0, 0), (0, 0, -h), sides[0]),
-            solids.quad((w / 2, 0, h), (-w, 0, 0), (0, 0, -h), sides[1]),
-            solids.quad((-w / 2, 0, h), (0, length, 0), (0, 0, -h), sides[2]),
-            solids.quad((w / 2, length, h), (0, -length, 0), (0, 0, -h), sides[3]),
-        ]
-
-    def pictures(self, walls: int = 3) -> None:
-        """Posters on the far wall, on both side walls and, of four `walls`, on the near one."""
-        w, length, h = self.size
-        for wall in range(walls):
-            span = w if wall in (0, 3) else length
-            for x in np.arange(0.7, span - 0.7, self.rng.uniform(0.9, 1.5)):
-                if self.rng.random() < 0.2:
-                    continue
-                wide, tall = self.rng.uniform(0.4, 0.8), self.rng.uniform(0.4, 0.9)
-                z = self.rng.uniform(1.2, max(h - tall / 2 - 0.25, 1.25)) + tall / 2
-                side = self.detail // 2 if wall in (0, 3) else self.detail // 4
-                look = self.add_texture(textures.poster(self.rng, side, side))
-                left = x - wide / 2 + self.rng.uniform(-0.15, 0.15)
-                if wall == 0:
-                    part = solids.quad(
-                        (left - w / 2, length - 0.02, z), (wide, 0, 0), (0, 0, -tall), look
-                    )
-                elif wall == 1:
-                    part = solids.quad((0.02 - w / 2, left, z), (0, wide, 0), (0, 0, -tall), look)
-                elif wall == 2:
-                    part = solids.quad(
-                        (w / 2 - 0.02, left + wide, z), (0, -wide, 0), (0, 0, -tall), look
-                    )
-                else:
-                    part = solids.quad(
-                        (left + wide - w / 2, 0.02, z), (-wide, 0, 0), (0, 0, -tall), look
-                    )
-                self.parts.append(part)
-
-    def shelf(self, x: float, y: float, yaw: float) -> None:
-        """A bookcase."""
-        size = (self.rng.uniform(0.7, 1.1), 0.32, self.rng.uniform(1.0, 2.0))
-        look = self.add_texture(textures.books(self.rng, self.detail // 2, self.detail // 2))
-        self.parts.append(solids.box((x, y, size[2] / 2), size, yaw, look, self.face()))
-        self.stand(x, y, size, yaw)
-
-    def table(self, x: float, y: float, yaw: float) -> None:
-        """A table with a monitor, boxes and cans on it."""
-        rng = self.rng
-        size = (rng.uniform(1.0, 1.6), rng.uniform(0.6, 0.8), rng.uniform(0.68, 0.78))
-        look = self.face()
-        turn = solids.yaw_rotation(yaw)
-        parts = [solids.box((0, 0, size[2]), (size[0], size[1], 0.04), 0, look, look)]
-        for sx in (-1, 1):
-            for sy in (-1, 1):
-                leg = (sx * (size[0] / 2 - 0.05), sy * (size[1] / 2 - 0.05), size[2] / 2)
-                parts.append(solids.box(leg, (0.05, 0.05, size[2]), 0, look, look))
-        monitor = self.add_texture(textures.screen(rng, self.detail // 4, self.detail // 4))
-        parts.append(
-            solids.box(
-                (rng.uniform(-0.3, 0.3), 0.12, size[2] + 0.24),
-                (0.52, 0.05, 0.34),
-                rng.normal(0, 0.2),
-                monitor,
-                look,
-            )
-        )
-        for _ in range(int(rng.integers(3, 7))):
-            thing = rng.uniform(0.07, 0.26, 3)
-            place = (
-                rng.uniform(-0.42, 0.42) * size[0],
-                rng.uniform(-0.4, 0.4) * size[1],
-                size[2] + 0.02 + thing[2] / 2,
-            )
-            parts.append(self.thing(place, thing))
-        self.parts.append(solids.join(parts).moved(turn, (x, y, 0.0)))
-        self.stand(x, y, size, yaw)
-
-    def thing(self, place: tuple[float, float, float], size: NDArray[np.float64]) -> Mesh:
-        """A small box or can."""
-        if self.rng.random() < 0.6:
-            look = self.face()
-            return solids.box(place, size, self.rng.uniform(0, 3), look, look)
-        return self.cylinder(place, size[0] / 2, size[2])
-
-    def cylinder(self, centre: tuple[float, float, float], radius: float, height: float) -> Mesh:
-        """An upright cylinder with a lid."""
-        z = np.array([0.5, 0.5, 0.4, -0.5], dtype=np.float32) * height
-        r = np.array([0.02, 1.0, 1.0, 1.0], dtype=np.float32) * radius
-        rings = np.zeros((4, 3), dtype=np.float32)
-        rings[:, 2] = z
-        turn: tuple[float, float, float] = (0.0, 1.0, 0.0)
-        return solids.tube(
-            rings + np.array(centre, dtype=np.float32), np.stack([r, r], 1), turn, self.face(), 20
-        )
-
-    def carton(self, x: float, y: float, yaw: float) -> None:
-        """A crate, cupboard or barrel on the floor."""
-        size = self.rng.uniform((0.35, 0.35, 0.3), (0.8, 0.6, 1.1))
-        if self.rng.random() < 0.7:
-            self.parts.append(solids.box((x, y, size[2] / 2), size, yaw, self.face(), self.face()))
-        else:
-            self.parts.append(self.cylinder((x, y, size[2] / 2), size[0] / 2, size[2]))
-        self.stand(x, y, (size[0], size[1], size[2]), yaw)
-
-    def stand(self, x: float, y: float, size: tuple[float, float, float], yaw: float) -> None:
-        """Note the floor a piece of furniture takes."""
-        c, s = abs(np.cos(yaw)), abs(np.sin(yaw))
-        half = ((c * size[0] + s * size[1]) / 2, (s * size[0] + c * size[1]) / 2)
-        self.footprints.append((x, y, float(half[0]), float(half[1])))
-
-    def lighting(self) -> Lighting:
-        """Two or three lamps below the ceiling and an ambient light, each with its tint."""
-        w, length, h = self.size
-        count = int(self.rng.integers(2, 4))
-        lamps = self.rng.uniform((-w / 2, 0.3, h - 0.6), (w / 2, length - 0.3, h - 0.1), (count, 3))
-        tint = 1 + self.rng.normal(0, 0.05, (count, 3))
-        power = tint * self.rng.uniform(0.5, 1.1, (count, 1))
-        ambient = self.rng.uniform(0.4, 0.7) * (1 + self.rng.normal(0, 0.03, 3))
-        return Lighting(
-            lamps.astype(np.float32), power.astype(np.float32), ambient.astype(np.float32)
-        )
-
-    def line_sides(self, first: float) -> None:
-        """Furniture along both side walls from y = `first` m on."""
-        w, length, _ = self.size
-        for side in (-1, 1):
-            for y in np.arange(first, length - 0.9, 1.2):
-                kind = (self.shelf, self.carton)[int(self.rng.integers(2))]
-                kind(side * (w / 2 - 0.35), float(y), np.pi / 2)
-
-    def room(self) -> Room:
-        """What has been built, with shadows under it and lamps above."""
-        footprints = np.array(self.footprints, dtype=np.float32).reshape(-1, 4)
-        _shade_floor(self.textures[self.floor], footprints, self.size)
-        return Room(
-            self.size, solids.join(self.parts), tuple(self.textures), self.lighting(), footprints
-        )
-
-
-def _cornered(image: Texture) -> Texture:
-    """The texture darkened towards its border, as corners of a room are."""
-    height, width = image.shape[:2]
-    x = np.minimum(np.arange(width), np.arange(width)[::-1]) / width
-    y = np.minimum(np.arange(height), np.arange(height)[::-1]) / height
-    shade = (1 - 0.3 * np.exp(-x / 0.05))[None] * (1 - 0.3 * np.exp(-y / 0.06))[:, None]
-    darkened: Texture = np.clip(image * shade[..., None], 0, 255).astype(np.uint8)
-    return darkened
-
-
-def texture_detail(size: tuple[int, int]) -> int:
-    """The side of the largest texture, px, that images of `size` (height, width) can show."""
-    widest = max(size)
-    return 1024 if widest > 320 else 512 if widest > 160 else 256
-
-
-def furnished_room(
-    rng: np.random.Generator,
-    size: tuple[float, float, float],
-    walk_depth: float,
-    detail: int = 1024,
-) -> Room:
-    """Draw a room with furniture along the far wall and both sides.
-
-    size: (width, length, height) m; walk_depth: y up to which the floor stays free between the
-    sides, m;
-    detail: side of the largest texture, px, a power of two of at least 128. Tables that would stand
-    in 0..walk_depth are moved behind it.
-    """
-    build = _Builder(rng, size, detail)
-    build.shell()
-    build.pictures()
-    w, length, _ = size
-    for x in np.arange(-w / 2 + 0.6, w / 2 - 0.5, 1.25):
-        kind = (build.shelf, build.table, build.carton, build.table)[int(rng.integers(4))]
-        kind(
-            float(x + rng.uniform(-0.1, 0.1)), length - rng.uniform(0.35, 0.5), rng.normal(0, 0.04)
-        )
-    for x in np.arange(-w / 2 + 1.2, w / 2 - 1.0, 1.9):
-        y = length - rng.uniform(1.4, 1.9)
-        if y > walk_depth + 0.5 and rng.random() < 0.7:
-            (build.table, build.carton)[int(rng.integers(2))](float(x), y, rng.uniform(-0.5, 0.5))
-    build.line_sides(max(walk_depth - 0.4, 0.8))
-    return build.room()
-
-
-def round_room(
-    rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024
-) -> Room:
-    """Draw a room with furniture and pictures along all four walls and a free middle; arguments as
-    `furnished_room`.
-    """
-    build = _Builder(rng, size, detail)
-    build.shell()
-    build.pictures(walls=4)
-    w, length, _ = size
-    for y, yaw in ((length - 0.4, 0.0), (0.4, np.pi)):
-        for x in np.arange(-w / 2 + 0.6, w / 2 - 0.5, 1.25):
-            kind = (build.shelf, build.table, build.carton)[int(rng.integers(3))]
-            kind(float(x + rng.uniform(-0.1, 0.1)), y, yaw + rng.normal(0, 0.04))
-    build.line_sides(1.3)
-    return build.room()
-
-
-def plain_room(
-    rng: np.random.Generator, size: tuple[float, float, float], detail: int = 1024
-) -> Room:
-    """Draw a room of plain walls with little before them; arguments as `furnished_room`."""
-    build = _Builder(rng, size, detail)
-    build.shell(plain=True)
-    w, length, _ = size
-    for x in (-w / 2 + rng.uniform(0.9, 1.6), w / 2 - rng.uniform(0.9, 1.6)):
-        kind = (build.table, build.carton)[int(rng.integers(2))]
-        kind(float(x), length - 0.5, rng.normal(0, 0.04))
-    return build.room()
-
-
-def _shade_floor(
-    floor: Texture, footprints: NDArray[np.float32], size: tuple[float, float, float]
-) -> None:
-    """Soft shadows of the furniture, laid over the floor's texture in place."""
-    height, width = floor.shape[:2]
-    shadow = np.ones((height, width), dtype=np.float32)
-    scale = np.array([width / size[0], height / size[1]])
-    for x, y, half_x, half_y in footprints:
-        low = (np.array([x - half_x + size[0] / 2, size[1] - y - half_y]) * scale).astype(int)
-        high = (np.array([x + half_x + size[0] / 2, size[1] - y + half_y]) * scale).astype(int)
-        shadow[max(low[1], 0) : high[1], max(low[0], 0) : high[0]] = 0.45
-    soft = cv2.GaussianBlur(shadow, (0, 0), 0.18 * float(scale[0]))
-    floor[:] = (floor * soft[..., None]).astype(np.uint8)

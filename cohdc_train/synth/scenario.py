@@ -1,4 +1,4 @@
-"""What a sequence shows: room, camera path, and what everybody does, drawn from a seed."""
+"""Draw a scene from a seed: room, camera path, and the actions of all actors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,42 +8,42 @@ import cv2
 import numpy as np
 
 from cohdc_train.errors import DataError
-from cohdc_train.synth import furniture
 from cohdc_train.synth import people as bodies
-from cohdc_train.synth import walk_paths as walks
-from cohdc_train.synth.actors import Actor, Sitter, Thing, Walker
-from cohdc_train.synth.camera_motion import CameraMotion, Doubles, camera_path, loop_heading, sway
-from cohdc_train.synth.mesh import join
+from cohdc_train.synth.actor_factory import EYE_Y, ActorFactory
+from cohdc_train.synth.actors import Actor
+from cohdc_train.synth.camera_motion import (
+    CameraMotion,
+    camera_path,
+)
+from cohdc_train.synth.mesh import join_meshes
 from cohdc_train.synth.random_streams import stream
-from cohdc_train.synth.renderer import Atlas, Camera, View, render
-from cohdc_train.synth.room import Room, furnished_room, plain_room, round_room, texture_detail
-from cohdc_train.synth.walk_paths import Walk
+from cohdc_train.synth.renderer import Atlas, RenderCamera, RenderedView, render
+from cohdc_train.synth.room import Room
+from cohdc_train.synth.room_layouts import furnished_room, loop_room, plain_room, texture_detail
+from cohdc_train.types import FloatArray
 
 Action = Literal["walk", "stop_and_go", "fill_view", "sit"]
 RATE = 30.0  # frames per second
-TRUTH_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own stamp
+POSES_PER_FRAME = 3  # poses written per frame: 90 Hz, every third at a frame's own timestamp
 SHARE = (0.26, 0.38)  # mean share of the pixels on people and cart that a scene is drawn for
-CROWD, CROWD_SHARE = 6, (0.36, 0.52)  # more people than this are a crowd, which covers more
+CROWD, CROWD_SHARE = 6, (0.36, 0.52)  # more people are a crowd, which covers more
 PEAK = 0.62  # share that no frame should exceed
-EMPTY = 0.2  # share of the frames that may show next to nobody
-_COARSE_BIAS = 0.87  # exact over coarse share: pixels touched by a point count as whole ones
-_DRAWS = 24  # how often the ways are drawn anew to get there
-# m beyond the view's border where people turn
-_REACH = {"xyz": 0.75, "halfsphere": 1.2, "static": 0.6, "rpy": 1.2, "loop": 0.75}
-_EYE_Y = 0.9  # m from the wall behind the camera
+EMPTY = 0.2  # share of the frames that may show nearly no actor
+_COARSE_BIAS = 0.87  # exact share over coarse share, where each point fills a whole pixel
+_MAX_DRAWS = 24  # of the paths, to reach these shares
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What happens in the room.
+class SceneConfig:
+    """Events in the room.
 
     Args:
         action: of the people. walk: they cross the view again and again; stop_and_go: they stand
             still for seconds, then walk on; fill_view: one comes up to the camera and fills its
-            view for a while, the others walk; sit: they sit and fidget a little.
-        cart: a loaded cart that rolls to and fro across the view, by itself or pushed by the first
+            view for a while, the others walk; sit: they sit and move a little.
+        cart: a loaded cart that moves back and forth across the view, alone or pushed by the first
             of the people.
-        walls: textured and hung with pictures, or plain.
+        walls: textured and hung with posters, or plain.
     """
 
     action: Action = "walk"
@@ -60,107 +60,50 @@ class Setting:
                 )
         if self.cart == "pushed" and people < 1:
             raise DataError("scene.cart: pushed, but there are 0 people to push it")
-        if motion == "loop" and self != Setting():
+        if motion == "loop" and self != SceneConfig():
             raise DataError(
                 "motion: a loop goes with people who walk in a textured room, without a cart"
             )
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Everything a sequence shows, as functions of the frame number.
+class RenderedScene:
+    """Everything that a sequence shows, as functions of the frame number.
 
-    truth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own; metered:
-    frames whose brightness sets the exposure of all.
+    Attributes:
+        room: walls and furniture.
+        actors: people and movable objects.
+        camera: intrinsics.
+        groundtruth: [3 (n - 1) + 1, 4, 4] T_wc, m, at 90 Hz: every third pose is a frame's own.
+        metered: frames whose brightness sets the exposure of all.
     """
 
     room: Room
     actors: tuple[Actor, ...]
-    camera: Camera
-    truth: Doubles
+    camera: RenderCamera
+    groundtruth: FloatArray
     metered: tuple[int, ...] = (0,)
 
     @property
-    def poses(self) -> Doubles:
-        """[n, 4, 4] T_wc of the frames, m."""
-        return self.truth[::TRUTH_PER_FRAME]
+    def poses(self) -> FloatArray:
+        """Camera poses of the frames, [n, 4, 4] T_wc, m."""
+        return self.groundtruth[::POSES_PER_FRAME]
 
     def atlas(self) -> Atlas:
-        """The textures of room and actors."""
+        """Return the textures of room and actors."""
         return Atlas(
             [*self.room.textures, *(look for actor in self.actors for look in actor.textures)]
         )
 
-    def view(self, frame: int, atlas: Atlas) -> View:
-        """The frame as a perfect camera sees it, the actors as instances 1.. in their order."""
+    def render_frame(self, frame: int, atlas: Atlas) -> RenderedView:
+        """Render a frame as a perfect camera sees it; actors are instances 1.. in their order."""
         meshes, first = [self.room.mesh], len(self.room.textures)
         for k, actor in enumerate(self.actors):
-            meshes.append(actor.mesh(frame).named(k + 1, first))
+            meshes.append(actor.mesh(frame).as_instance(k + 1, first))
             first += len(actor.textures)
-        return render(join(meshes), atlas, self.room.lighting, self.camera, self.poses[frame])
-
-
-@dataclass(frozen=True)
-class _Stage:
-    """What ways are drawn from. times [n] s and poses [n, 4, 4] T_wc of the frames."""
-
-    rng: np.random.Generator
-    times: Doubles
-    poses: Doubles
-    motion: CameraMotion
-
-    def crowd(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
-        """People who cross the view; in a loop they lead the camera round."""
-        if not people:
-            return []
-        ways = walks.crowd(self.rng, self.times, distances, _REACH[self.motion])
-        if self.motion == "loop":
-            ways = walks.led_round(ways, self.times, self.poses[:, :2, 3], loop_heading(self.times))
-        else:
-            ways = tuple(way.moved(0.0, _EYE_Y) for way in ways)
-        return [Walker(person, way) for person, way in zip(people, ways, strict=True)]
-
-    def stopping(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
-        """People who stop and go."""
-        ways = walks.stop_and_go(self.rng, self.times, distances)
-        return [
-            Walker(person, way.moved(0.0, _EYE_Y)) for person, way in zip(people, ways, strict=True)
-        ]
-
-    def filling(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
-        """One before the camera, the others cross behind."""
-        first = [Walker(person, walks.approach(self.times, self.poses)) for person in people[:1]]
-        return [*first, *self.crowd(people[1:], distances[1:] + 0.6)]
-
-    def seated(self, people: list[bodies.Person], distances: Doubles) -> list[Actor]:
-        """People side by side on chairs, turned to the camera more or less."""
-        sitters: list[Actor] = []
-        chairs: list[Actor] = []
-        still = np.zeros(len(self.times))
-        sides = np.linspace(-0.38, 0.38, len(people)) if len(people) > 1 else np.zeros(1)
-        for person, side, distance in zip(
-            people, self.rng.permutation(sides), distances, strict=True
-        ):
-            place = (float(side * distance), float(distance + _EYE_Y))
-            heading = float(np.arctan2(-1.0, -side) + self.rng.uniform(-0.7, 0.7))
-            fidget = sway(self.rng, self.times, 1.0, 3.0)
-            gesture = np.clip(4 * sway(self.rng, self.times, 1.0, 6.0) - 3, 0, 1)
-            sitters.append(Sitter(person, place, heading, fidget, gesture))
-            chair = furniture.chair(bodies.seat_height(person, bodies.sitting(0.0, 0.0)))
-            rest = Walk(np.tile(place, (len(still), 1)), still + heading, still, still)
-            chairs.append(Thing(chair, (furniture.chair_texture(self.rng),), rest))
-        return [*sitters, *chairs]
-
-    def rolling(self, pusher: list[bodies.Person], distance: float) -> list[Actor]:
-        """A cart, and who pushes it."""
-        body, looks = furniture.cart(self.rng)
-        line = walks.errands(self.rng, self.times, 0.6 * distance + 0.35, (0.5, 1.0), 0.7)
-        way, behind = walks.rolled(self.rng, self.times, line, furniture.HANDLE - 0.5)
-        ways = [walk.moved(0.0, distance + _EYE_Y) for walk in (way, behind)]
-        return [
-            *(Walker(person, ways[1], pushes=True) for person in pusher),
-            Thing(body, looks, ways[0]),
-        ]
+        return render(
+            join_meshes(meshes), atlas, self.room.lighting, self.camera, self.poses[frame]
+        )
 
 
 def draw_scene(
@@ -169,20 +112,25 @@ def draw_scene(
     size: tuple[int, int],
     motion: CameraMotion,
     people: int,
-    setting: Setting | None = None,
-) -> Scene:
-    """Draw the room, the camera's path and the ways, so that what moves covers 20-40 % of the
-    pixels on average.
+    setting: SceneConfig | None = None,
+) -> RenderedScene:
+    """Draw the room, the camera path and the actors, who cover 20-40 % of the pixels on average.
 
-    size: (height, width) px. Ways are drawn again, nearer or farther, until a coarse rendering of
-    them fits SHARE (a
-    crowd: CROWD_SHARE), PEAK and EMPTY; the best is taken. Whoever fills the view is left out of
-    that.
+    Paths are drawn again, nearer or farther, until a coarse rendering of them fits SHARE (a crowd:
+    CROWD_SHARE), PEAK and EMPTY; the best is taken. A person who fills the view does not count
+    there.
+
+    Args:
+        seed: of all random numbers.
+        frames: number of frames.
+        size: (height, width), px.
+        motion: of the camera.
+        people: number of people.
+        setting: events in the room.
     """
-    setting = setting or Setting()
-    rng = stream(
-        seed, "sequence", 1
-    )  # apart from the room's, whose draws depend on the size of its textures
+    setting = setting or SceneConfig()
+    # apart from the room's stream, whose draws depend on the size of its textures
+    rng = stream(seed, "sequence", 1)
     length, height = float(rng.uniform(4.9, 5.5)), float(rng.uniform(2.5, 2.8))
     room = _room(
         seed,
@@ -191,29 +139,37 @@ def draw_scene(
         motion,
         setting,
     )
-    fine = np.arange(TRUTH_PER_FRAME * (frames - 1) + 1) / (RATE * TRUTH_PER_FRAME)
-    middle = room.size[1] / 2 if motion == "loop" else _EYE_Y
+    fine = np.arange(POSES_PER_FRAME * (frames - 1) + 1) / (RATE * POSES_PER_FRAME)
+    middle = room.size[1] / 2 if motion == "loop" else EYE_Y
     truth = camera_path(rng, fine, motion, np.array([0.0, middle, rng.uniform(1.25, 1.5)]))
     cast = [bodies.draw_person(rng, patterned=1.0) for _ in range(people)]
-    stage = _Stage(rng, fine[::TRUTH_PER_FRAME], truth[::TRUTH_PER_FRAME], motion)
-    nobody = people == 0 and setting.cart == "none"
+    factory = ActorFactory(rng, fine[::POSES_PER_FRAME], truth[::POSES_PER_FRAME], motion)
+    is_empty = people == 0 and setting.cart == "none"
     metered = tuple(k * frames // 5 for k in range(5)) if motion == "loop" else (0,)
-    fitted = not nobody and setting.action != "fill_view"
+    is_fitted = not is_empty and setting.action != "fill_view"
 
-    def draw(nearest: float) -> Scene:
-        return Scene(
-            room, _actors(stage, setting, cast, nearest), Camera.freiburg3(size), truth, metered
+    def draw(nearest: float) -> RenderedScene:
+        return RenderedScene(
+            room,
+            _actors(factory, setting, cast, nearest),
+            RenderCamera.freiburg3(size),
+            truth,
+            metered,
         )
 
-    return _fitted(draw, people) if fitted else draw(1.3)
+    return _best_scene(draw, people) if is_fitted else draw(1.3)
 
 
 def _room(
-    seed: int, size: tuple[float, float, float], detail: int, motion: CameraMotion, setting: Setting
+    seed: int,
+    size: tuple[float, float, float],
+    detail: int,
+    motion: CameraMotion,
+    setting: SceneConfig,
 ) -> Room:
     rng = stream(seed, "sequence")
     if motion == "loop":
-        return round_room(rng, size, detail)
+        return loop_room(rng, size, detail)
     return (
         plain_room(rng, size, detail)
         if setting.walls == "plain"
@@ -222,9 +178,9 @@ def _room(
 
 
 def _actors(
-    stage: _Stage, setting: Setting, cast: list[bodies.Person], nearest: float
+    factory: ActorFactory, setting: SceneConfig, cast: list[bodies.Person], nearest: float
 ) -> tuple[Actor, ...]:
-    """Everybody, the nearest `nearest` m from the eye: people first, things last."""
+    """Return all actors, the nearest `nearest` m from the eye: people first, objects last."""
     pushers = 1 if setting.cart == "pushed" else 0
     others = cast[pushers:]
     distances = nearest + min(0.35, 2.0 / max(len(others) - 1, 1)) * np.arange(
@@ -232,40 +188,40 @@ def _actors(
     )
     distances += 0.0 if setting.cart == "none" else 0.9
     act = {
-        "walk": stage.crowd,
-        "stop_and_go": stage.stopping,
-        "fill_view": stage.filling,
-        "sit": stage.seated,
+        "walk": factory.crowd,
+        "stop_and_go": factory.stopping,
+        "fill_view": factory.filling,
+        "sit": factory.seated,
     }
     actors = act[setting.action](others, distances)
     if setting.cart != "none":
-        actors += stage.rolling(cast[:pushers], nearest)
+        actors += factory.rolling(cast[:pushers], nearest)
     return tuple(sorted(actors, key=lambda actor: not actor.is_person))
 
 
-def _fitted(draw: Callable[[float], Scene], people: int) -> Scene:
-    """The best of some draws at distances that approach the wanted share."""
+def _best_scene(draw: Callable[[float], RenderedScene], people: int) -> RenderedScene:
+    """Return the best of some draws at distances that approach the wanted share."""
     wanted, peak_wanted = (CROWD_SHARE, 0.8) if people > CROWD else (SHARE, PEAK)
     nearest = 1.3
-    best: tuple[float, Scene] | None = None
-    for _ in range(_DRAWS):
+    candidates: list[tuple[float, RenderedScene]] = []
+    for _ in range(_MAX_DRAWS):
         scene = draw(nearest)
-        shares = _coarse_shares(scene)
-        mean, peak, empty = float(shares.mean()), float(shares.max()), float(np.mean(shares < 0.05))
+        shares = _coarse_coverage(scene)
+        mean, peak = float(shares.mean()), float(shares.max())
+        empty = float(np.mean(shares < 0.05))
         off = max(wanted[0] - mean, mean - wanted[1], 0.0)
         cost = off + 0.5 * max(peak - peak_wanted, 0.0) + 0.5 * max(empty - EMPTY, 0.0)
-        if best is None or cost < best[0]:
-            best = (cost, scene)
+        candidates.append((cost, scene))
         if cost == 0:
             break
         nearer = np.sqrt(max(mean, 0.02) / np.mean(wanted)) if peak <= peak_wanted else 1.05
         nearest = float(np.clip(nearest * nearer, 0.8 + 0.1 * min(people, CROWD), 1.6))
-    assert best is not None
-    return best[1]
+    _, best = min(candidates, key=lambda candidate: candidate[0])
+    return best
 
 
-def _coarse_shares(scene: Scene) -> Doubles:
-    """About the share of the pixels on actors in every sixth frame, from their points on 64 px."""
+def _coarse_coverage(scene: RenderedScene) -> FloatArray:
+    """Return the approximate share of pixels on actors in every sixth frame, at 64 px."""
     camera = scene.camera.resized(64 / scene.camera.width)
     shares = []
     for k in range(0, len(scene.poses), 6):

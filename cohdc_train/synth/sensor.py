@@ -1,32 +1,33 @@
-"""What an RGB-D camera of Kinect's kind makes of a rendered view: noise, blur, quantised depth with
-holes.
-"""
+"""Simulate an RGB-D camera of Kinect's kind: noise, blur, quantized depth with holes."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.synth.mesh import Floats
-from cohdc_train.synth.renderer import View
+from cohdc_train.synth.renderer import RenderedView
+from cohdc_train.types import Float32Array, Image, Mask
 
-DEPTH_SCALE = 5000.0  # TUM: units per metre of the 16 bit files
+DEPTH_SCALE = 5000.0  # TUM: units per meter of the 16 bit files
 NEAR, FAR = 0.4, 5.0  # m, the sensor's range
-RGB_SIGMA = 2.5  # grey levels
+RGB_SIGMA = 2.5  # gray levels
 EDGE_DROPOUT = 0.6
 
 
-def exposure(rgb: Floats, brightness: float = 0.37) -> float:
-    """The factor that brings a rendered image to the mean `brightness` (1 = white), as a camera's
-    automatic would.
-    """
+def exposure_gain(rgb: Float32Array, brightness: float = 0.37) -> float:
+    """Return the factor that brings an image to the mean `brightness` (1 = white)."""
     return brightness / max(float(np.minimum(rgb, 1.5 * rgb.mean()).mean()), 1e-3)
 
 
-def photograph(
-    rgb: Floats, rng: np.random.Generator, sigma: float = RGB_SIGMA, blur: float = 0.6
-) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8 of an exposed float image (1 = white): the optics' blur (sigma px), noise
-    (sigma grey levels).
+def add_sensor_noise(
+    rgb: Float32Array, rng: np.random.Generator, sigma: float = RGB_SIGMA, blur: float = 0.6
+) -> Image:
+    """Return [H, W, 3] uint8 of an exposed float image (1 = white), blurred and noisy.
+
+    Args:
+        rgb: [H, W, 3] float32.
+        rng: random numbers.
+        sigma: of the noise, gray levels.
+        blur: sigma of the optics' blur, px.
     """
     bounded = np.minimum(rgb, 1)
     soft = cv2.GaussianBlur(bounded, (0, 0), blur) if blur > 0.2 else bounded
@@ -34,8 +35,8 @@ def photograph(
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def smear(rgb: Floats, length: float, angle: float) -> Floats:
-    """Motion blur: the mean along a line of `length` px at `angle` rad."""
+def blur_motion(rgb: Float32Array, length: float, angle: float) -> Float32Array:
+    """Return an image blurred by motion: the mean along a line of `length` px at `angle` rad."""
     size = int(np.ceil(length)) | 1
     if size < 3:
         return rgb
@@ -49,20 +50,21 @@ def smear(rgb: Floats, length: float, angle: float) -> Floats:
     )
 
 
-def depth_edges(depth: Floats) -> NDArray[np.bool_]:
-    """[H, W] pixels whose 3 x 3 neighbourhood spans more than 4 % of its depth: both sides of every
-    outline.
+def depth_edges(depth: Float32Array) -> Mask:
+    """Return [H, W] pixels on both sides of every depth edge.
+
+    Their 3 x 3 neighborhood spans more than 4 % of its depth.
     """
     kernel = np.ones((3, 3), dtype=np.uint8)
     span = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
-    edges: NDArray[np.bool_] = span > 0.04 * depth
+    edges: Mask = span > 0.04 * depth
     return edges
 
 
-def measure_depth(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """[H, W] uint16 depth image, 5000 per metre, 0 = no reading.
+def measure_depth(view: RenderedView, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Return the [H, W] uint16 depth image, 5000 per meter, 0 = no reading.
 
-    Sigma .0012 + .0019 (z - .4)^2 m; 60 % of the readings on depth edges are lost, those of dark
+    Sigma .0012 + .0019 (z - .4)^2 m. 60 % of the readings on depth edges are lost, those of dark
     and of grazing surfaces in part, some in blobs, and all outside .4-5 m.
     """
     z = view.depth

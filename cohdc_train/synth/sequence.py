@@ -1,4 +1,4 @@
-"""`cohdc synth sequence`: an RGB-D sequence of people in a room, in TUM's layout, with its truth."""
+"""Render an RGB-D sequence of people in a room, in TUM's layout: `cohdc synth sequence`."""
 
 import json
 from dataclasses import asdict
@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import new_folder
-from cohdc_train.synth.actors import fastest
-from cohdc_train.synth.camera_motion import MOTIONS, CameraMotion, Doubles
+from cohdc_train.synth.actors import max_speed
+from cohdc_train.synth.camera_motion import MOTIONS, CameraMotion
+from cohdc_train.synth.option_checks import check_size_and_seed
 from cohdc_train.synth.random_streams import stream
-from cohdc_train.synth.renderer import Camera
-from cohdc_train.synth.scenario import RATE, TRUTH_PER_FRAME, Scene, Setting, draw_scene
-from cohdc_train.synth.sensor import DEPTH_SCALE, exposure, measure_depth, photograph
+from cohdc_train.synth.renderer import RenderCamera
+from cohdc_train.synth.scenario import POSES_PER_FRAME, RATE, RenderedScene, SceneConfig, draw_scene
+from cohdc_train.synth.sensor import DEPTH_SCALE, add_sensor_noise, exposure_gain, measure_depth
+from cohdc_train.types import FloatArray
 
-FIRST_STAMP = 1305031102.175304  # s
-MOVES = 0.05  # m/s: an actor none of whose points is faster stands still
-MOST_PEOPLE = 12
+FIRST_TIMESTAMP = 1305031102.175304  # s
+MIN_MOVING_SPEED = 0.05  # m/s, of the fastest point of an actor that moves
+MAX_PEOPLE = 12
 
 
 def sequence(
@@ -30,14 +32,13 @@ def sequence(
     seed: int = 0,
     motion: CameraMotion = "xyz",
     people: int = 3,
-    scene: Setting = Setting(),  # noqa: B008 - frozen, and jsonargparse reads the defaults from it
+    scene: SceneConfig = SceneConfig(),  # noqa: B008 - frozen; jsonargparse reads its defaults
 ) -> None:
-    """Render an RGB-D sequence with people in TUM's layout (rgb/, depth/, rgb.txt, depth.txt,
-    groundtruth.txt).
+    """Render an RGB-D sequence with people in TUM's layout.
 
-    Beside TUM's files: masks/ (255 = person), movers/ (255 = whoever and whatever moves in this
-    frame: not a person who stands or sits still, but a cart that rolls), camera.yaml, info.json
-    (share of person pixels per frame).
+    Writes rgb/, depth/, rgb.txt, depth.txt and groundtruth.txt, and further masks/ (255 = person),
+    movers/ (255 = moves in this frame: not a person who stands or sits still, but a cart that
+    rolls), camera.yaml and info.json (share of person pixels per frame).
 
     Args:
         out: new or empty folder.
@@ -47,16 +48,17 @@ def sequence(
         motion: camera motion as in TUM's walking sequences; loop: once round the room (give it 300
             frames and more).
         people: how many there are, 0 to 12; more than 6 are a crowd.
-        scene: what happens in the room.
+        scene: events in the room.
     """
     _check(frames, size, seed, motion, people)
     scene.check(motion, people)
     drawn = draw_scene(seed, frames, size, motion, people, scene)
     with new_folder(out) as draft:
         shares, moving = _write_frames(draft, drawn, seed)
-        title = f"synthetic_{'walking' if scene.action == 'walk' else scene.action}_{motion}, seed {seed}"
+        action = "walking" if scene.action == "walk" else scene.action
+        title = f"synthetic_{action}_{motion}, seed {seed}"
         _write_lists(draft, frames, title)
-        _write_truth(draft / "groundtruth.txt", drawn.truth, title)
+        _write_groundtruth(draft / "groundtruth.txt", drawn.groundtruth, title)
         _write_camera(draft / "camera.yaml", drawn.camera)
         info: dict[str, object] = {
             "seed": seed,
@@ -65,60 +67,58 @@ def sequence(
             "frames": frames,
             "size": list(size),
             "scene": asdict(scene),
-            "share": _spread(shares),
+            "share": _statistics(shares),
             "share_per_frame": [round(float(s), 5) for s in shares],
-            "movers": _spread(moving),
+            "movers": _statistics(moving),
         }
         (draft / "info.json").write_text(json.dumps(info, indent=1) + "\n")
     covered = f"people cover {shares.mean():.1%} ({shares.min():.1%}-{shares.max():.1%}) of each"
     print(f"{out}: {frames} frames; {covered}, {moving.mean():.1%} moves")
 
 
-def _spread(shares: Doubles) -> dict[str, float]:
+def _statistics(shares: FloatArray) -> dict[str, float]:
     return {"mean": float(shares.mean()), "min": float(shares.min()), "max": float(shares.max())}
 
 
 def _check(frames: int, size: tuple[int, int], seed: int, motion: str, people: int) -> None:
     if frames < 2:
         raise DataError(f"frames: {frames} is too few; a sequence has at least 2")
-    if min(size) < 48:
-        raise DataError(
-            f"size: {size[0]} x {size[1]} px is too small; height and width are at least 48"
-        )
-    if seed < 0:
-        raise DataError(f"seed: {seed} is negative")
+    check_size_and_seed(size, seed)
     if motion not in MOTIONS:
         raise DataError(f"motion: {motion!r} is none of {', '.join(MOTIONS)}")
-    if not 0 <= people <= MOST_PEOPLE:
-        raise DataError(f"people: {people} is not in 0..{MOST_PEOPLE}")
+    if not 0 <= people <= MAX_PEOPLE:
+        raise DataError(f"people: {people} is not in 0..{MAX_PEOPLE}")
 
 
-def stamps(frames: int) -> list[str]:
-    """The frames' time stamps as TUM writes them: seconds with six decimals."""
-    return [f"{FIRST_STAMP + k / RATE:.6f}" for k in range(frames)]
+def timestamps(frames: int) -> list[str]:
+    """Return the timestamps of the frames as TUM writes them: seconds with six decimals."""
+    return [f"{FIRST_TIMESTAMP + k / RATE:.6f}" for k in range(frames)]
 
 
-def _write_frames(folder: Path, scene: Scene, seed: int) -> tuple[Doubles, Doubles]:
-    """Write rgb/, depth/, masks/ and movers/; returns the shares of person pixels and of moving
-    ones per frame.
-    """
+def _write_frames(folder: Path, scene: RenderedScene, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Write rgb/, depth/, masks/ and movers/, and return the shares of person and moving pixels."""
     for name in ("rgb", "depth", "masks", "movers"):
         (folder / name).mkdir()
     rng = stream(seed, "sequence", 2)
     atlas, frames = scene.atlas(), len(scene.poses)
-    gain = np.float32(np.mean([exposure(scene.view(k, atlas).rgb) for k in scene.metered]))
+    gain = np.float32(
+        np.mean([exposure_gain(scene.render_frame(k, atlas).rgb) for k in scene.metered])
+    )
     shares = []
-    for k, stamp in enumerate(stamps(frames)):
-        view = scene.view(k, atlas)
-        rgb = photograph(view.rgb * gain, rng, blur=0.6 * scene.camera.width / 640)
+    for k, timestamp in enumerate(timestamps(frames)):
+        view = scene.render_frame(k, atlas)
+        rgb = add_sensor_noise(view.rgb * gain, rng, blur=0.6 * scene.camera.width / 640)
         person = np.array([False, *(actor.is_person for actor in scene.actors)])[view.instance]
         moves = np.array(
-            [False, *(fastest(actor, k, frames, RATE) > MOVES for actor in scene.actors)]
+            [
+                False,
+                *(max_speed(actor, k, frames, RATE) > MIN_MOVING_SPEED for actor in scene.actors),
+            ]
         )[view.instance]
-        _write_png(folder / "rgb" / f"{stamp}.png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        _write_png(folder / "depth" / f"{stamp}.png", measure_depth(view, rng))
-        _write_png(folder / "masks" / f"{stamp}.png", person.astype(np.uint8) * 255)
-        _write_png(folder / "movers" / f"{stamp}.png", moves.astype(np.uint8) * 255)
+        _write_png(folder / "rgb" / f"{timestamp}.png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        _write_png(folder / "depth" / f"{timestamp}.png", measure_depth(view, rng))
+        _write_png(folder / "masks" / f"{timestamp}.png", person.astype(np.uint8) * 255)
+        _write_png(folder / "movers" / f"{timestamp}.png", moves.astype(np.uint8) * 255)
         shares.append((person.mean(), moves.mean()))
     people, moving = np.array(shares, dtype=np.float64).T
     return people, moving
@@ -134,23 +134,23 @@ def _write_png(path: Path, image: NDArray[Any]) -> None:
 def _write_lists(folder: Path, frames: int, title: str) -> None:
     for kind, content in (("rgb", "color images"), ("depth", "depth maps")):
         lines = [f"# {content}", f"# file: '{title}'", "# timestamp filename"]
-        lines += [f"{stamp} {kind}/{stamp}.png" for stamp in stamps(frames)]
+        lines += [f"{timestamp} {kind}/{timestamp}.png" for timestamp in timestamps(frames)]
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
 
 
-def _write_truth(path: Path, truth: Doubles, title: str) -> None:
-    """T_wc as `stamp tx ty tz qx qy qz qw`, m, at 90 Hz."""
+def _write_groundtruth(path: Path, truth: FloatArray, title: str) -> None:
+    """Write T_wc as `timestamp tx ty tz qx qy qz qw`, m, at 90 Hz."""
     from scipy.spatial.transform import Rotation
 
     quaternions = Rotation.from_matrix(truth[:, :3, :3]).as_quat()
     lines = ["# ground truth trajectory", f"# file: '{title}'", "# timestamp tx ty tz qx qy qz qw"]
     for k, (position, quaternion) in enumerate(zip(truth[:, :3, 3], quaternions, strict=True)):
         numbers = " ".join(f"{v:.7f}" for v in (*position, *quaternion))
-        lines.append(f"{FIRST_STAMP + k / (RATE * TRUTH_PER_FRAME):.6f} {numbers}")
+        lines.append(f"{FIRST_TIMESTAMP + k / (RATE * POSES_PER_FRAME):.6f} {numbers}")
     path.write_text("\n".join(lines) + "\n")
 
 
-def _write_camera(path: Path, camera: Camera) -> None:
+def _write_camera(path: Path, camera: RenderCamera) -> None:
     values = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     lines = [f"{name}: {value:.6f}" for name, value in values.items()]
     lines += [

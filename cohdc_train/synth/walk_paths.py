@@ -1,14 +1,15 @@
-"""Where people walk and things roll in a sequence. World frame: z up, y away from the camera, m, s,
-rad.
+"""Paths of people and objects in a sequence.
+
+World frame: z up, y away from the camera; m, s, rad.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cohdc_train.synth.camera_motion import Doubles, sway
+from cohdc_train.synth.camera_motion import sway
+from cohdc_train.types import FloatArray, IntArray
 
 _SMOOTH = 0.35  # s over which a pace changes
 _TURN = 0.8  # s that a turn on the spot takes
@@ -17,31 +18,38 @@ _NEAR = 0.55  # m from the camera to the axis of a body that fills its view
 
 @dataclass(frozen=True)
 class Walk:
-    """One person's way.
+    """Path of one person or object.
 
-    position: [n, 2] m; heading: [n] rad; travelled: [n] m; pace: [n] 0 = stands, 1 = walks.
+    Attributes:
+        position: [n, 2] m.
+        heading: [n] rad.
+        distance_walked: [n] m.
+        pace: [n] 0 = stands, 1 = walks.
     """
 
-    position: Doubles
-    heading: Doubles
-    travelled: Doubles
-    pace: Doubles
+    position: FloatArray
+    heading: FloatArray
+    distance_walked: FloatArray
+    pace: FloatArray
 
-    def moved(self, x: float, y: float) -> "Walk":
-        """The same way, `x` and `y` m further."""
+    def shifted(self, x: float, y: float) -> "Walk":
+        """Return the path shifted by `x` and `y` m."""
         return replace(self, position=self.position + np.array([x, y]))
 
 
 def crowd(
-    rng: np.random.Generator, times: Doubles, distances: Doubles, reach: float
+    rng: np.random.Generator, times: FloatArray, distances: FloatArray, reach: float
 ) -> tuple[Walk, ...]:
-    """People who cross the view side by side, again and again, slowly, mostly in one direction,
-    stopping midway.
+    """Draw people who cross the view side by side, slowly, mostly in one direction, with a stop.
 
-    times: [n] s, even steps; distances: [p] m, how far in front of the eye each one walks; reach:
-    how far beyond the border of the view a crossing begins and ends, m. Between two crossings
-    nobody is in sight. A group that moves as one and covers half the view is what misleads a camera
-    that trusts the majority. Positions are relative to the eye.
+    Between two crossings nobody is in sight. A group that moves as one and covers half the view
+    misleads a camera that trusts the majority. Positions are relative to the eye.
+
+    Args:
+        rng: random numbers.
+        times: [n] s, even steps.
+        distances: [p] m, of each person before the eye.
+        reach: how far beyond the border of the view a crossing begins and ends, m.
     """
     step = float(times[1] - times[0])
     sides = (
@@ -51,7 +59,7 @@ def crowd(
     )
     half = float(np.max(0.62 * distances + np.abs(sides))) + reach
     usual = float(rng.choice([-1.0, 1.0]))
-    pieces: list[Doubles] = []
+    pieces: list[FloatArray] = []
     while sum(len(piece) for piece in pieces) < len(times):
         direction = usual if rng.random() < 5 / 6 else -usual
         path = direction * _crossing(rng, step, half)
@@ -66,13 +74,19 @@ def crowd(
 
 def _walk_in_crowd(
     rng: np.random.Generator,
-    times: Doubles,
-    line: Doubles,
+    times: FloatArray,
+    line: FloatArray,
     place: tuple[float, float],
-    jumps: NDArray[np.int64],
+    jumps: IntArray,
 ) -> Walk:
-    """One of a crowd: `line` [n] m is the way of its middle, `place` (distance, side) m this
-    person's place in it.
+    """Draw the path of one person in a crowd.
+
+    Args:
+        rng: random numbers.
+        times: [n] s.
+        line: [n] m, path of the middle of the crowd.
+        place: (distance, side) m, of this person in it.
+        jumps: frames at which the crowd is put elsewhere.
     """
     x = line + place[1] + sway(rng, times, 0.06, 4.0)
     y = place[0] + sway(rng, times, 0.08, 6.0)
@@ -80,12 +94,15 @@ def _walk_in_crowd(
 
 
 def walk_along(
-    times: Doubles, position: Doubles, start: float, jumps: NDArray[np.int64] | None = None
+    times: FloatArray, position: FloatArray, start: float, jumps: IntArray | None = None
 ) -> Walk:
-    """A person who walks where `position` [n, 2] m leads, looking ahead.
+    """Return a person who walks where `position` [n, 2] m leads, looking ahead.
 
-    start: m travelled before; jumps: frames at which the person is put elsewhere and goes on as
-    before.
+    Args:
+        times: [n] s.
+        position: [n, 2] m.
+        start: m walked before.
+        jumps: frames at which the person is put elsewhere and continues as before.
     """
     velocity = np.diff(position, axis=0, prepend=position[:1])
     if jumps is not None:
@@ -97,8 +114,8 @@ def walk_along(
     return Walk(position, heading, start + np.cumsum(speed), pace)
 
 
-def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
-    """[k] m from -half to half at even time steps, with a stop near the middle."""
+def _crossing(rng: np.random.Generator, step: float, half: float) -> FloatArray:
+    """Draw [k] m from -half to half at even time steps, with a stop near the middle."""
     pace = rng.uniform(0.5, 0.75)
     stop = rng.uniform(-0.25, 0.25)
     pause = rng.uniform(0.7, 1.5)
@@ -110,52 +127,65 @@ def _crossing(rng: np.random.Generator, step: float, half: float) -> Doubles:
     return _smooth(x, _SMOOTH / step)
 
 
-def _smooth(line: Doubles, frames: float) -> Doubles:
-    """Moving mean of [n] over `frames`."""
+def _smooth(line: FloatArray, frames: float) -> FloatArray:
+    """Return the moving mean of [n] values over `frames`."""
     window = max(round(frames), 1) | 1
-    smooth: Doubles = np.convolve(
+    smooth: FloatArray = np.convolve(
         np.pad(line, window // 2, mode="edge"), np.ones(window) / window, mode="valid"
     )
     return smooth
 
 
-def led_round(
-    walks: tuple[Walk, ...], times: Doubles, eyes: Doubles, headings: Doubles
+def follow_camera(
+    walks: tuple[Walk, ...], times: FloatArray, eyes: FloatArray, headings: FloatArray
 ) -> tuple[Walk, ...]:
-    """The walks of a crowd bent into arcs about `eyes` [n, 2] m, and turned with a camera that
-    looks along `headings`.
+    """Bend the walks of a crowd into arcs about the eye, and turn them with the camera.
 
-    headings: [n] rad to the right of +y. What was ahead and to the side of the eye becomes a
-    distance and an angle, so that people who walk round the room with the camera, crossing its
-    view, never meet a wall.
+    Distance ahead and to the side of the eye become a distance and an angle, so that people who
+    walk round the room with the camera, crossing its view, never meet a wall.
+
+    Args:
+        walks: of the crowd.
+        times: [n] s.
+        eyes: [n, 2] m.
+        headings: [n] rad to the right of +y, of the camera.
     """
     bent = []
     for walk in walks:
         distance = walk.position[:, 1]
         angle = headings + walk.position[:, 0] / distance
         position = eyes + distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], 1)
-        bent.append(walk_along(times, position, float(walk.travelled[0])))
+        bent.append(walk_along(times, position, float(walk.distance_walked[0])))
     return tuple(bent)
 
 
-def errands(
-    rng: np.random.Generator, times: Doubles, reach: float, pause: tuple[float, float], pace: float
-) -> Doubles:
-    """[n] m: a thing that stands still, goes to another place within +-reach, stands again, and so
-    on.
+def back_and_forth(
+    rng: np.random.Generator,
+    times: FloatArray,
+    reach: float,
+    pause: tuple[float, float],
+    pace: float,
+) -> FloatArray:
+    """Draw the positions [n], m, of an object that moves within +-reach, and stands between.
 
-    It begins at rest; pauses last `pause` (least, most) s; pace: m/s. Every way leads to the other
-    side of 0.
+    It begins at rest. Every move leads to the other side of 0.
+
+    Args:
+        rng: random numbers.
+        times: [n] s.
+        reach: m.
+        pause: shortest and longest, s.
+        pace: m/s.
     """
-    knots = list(_stops(rng, float(times[-1]), reach, pause, pace))
+    knots = list(_waypoints(rng, float(times[-1]), reach, pause, pace))
     line = np.interp(times, [t for t, _ in knots], [x for _, x in knots])
     return _smooth(line, _SMOOTH / float(times[1] - times[0]))
 
 
-def _stops(
+def _waypoints(
     rng: np.random.Generator, until: float, reach: float, pause: tuple[float, float], pace: float
 ) -> Iterator[tuple[float, float]]:
-    """(s, m) at which the pace changes, the first at 0 s, the last after `until`."""
+    """Yield (s, m) at which the pace changes, the first at 0 s, the last after `until`."""
     t, x = 0.0, float(rng.choice([-1.0, 1.0]) * reach * rng.uniform(0.5, 1))
     while t <= until:
         yield t, x
@@ -166,14 +196,18 @@ def _stops(
     yield t, x
 
 
-def rolled(
-    rng: np.random.Generator, times: Doubles, line: Doubles, behind: float
+def cart_path(
+    rng: np.random.Generator, times: FloatArray, line: FloatArray, behind: float
 ) -> tuple[Walk, Walk]:
-    """The ways of a cart that goes forwards and backwards along `line` [n] m, aslant, and of who
-    pushes it.
+    """Draw the path of a cart that moves back and forth along a slanted line, and of its pusher.
 
-    behind: where along the cart's x its pusher walks, m. Positions are relative to the middle of
-    the line.
+    Positions are relative to the middle of the line.
+
+    Args:
+        rng: random numbers.
+        times: [n] s.
+        line: [n] m, along the line.
+        behind: x of the pusher in the frame of the cart, m.
     """
     slant = float(rng.uniform(-0.25, 0.25))
     heading = slant + np.pi * float(rng.integers(2))
@@ -187,25 +221,29 @@ def rolled(
     return cart, replace(cart, position=position + behind * ahead)
 
 
-def stop_and_go(rng: np.random.Generator, times: Doubles, distances: Doubles) -> tuple[Walk, ...]:
-    """People who stand in the view for 1.5-2.5 s without a movement, walk on, stand again, each at
-    a time of their own.
+def stop_and_go(
+    rng: np.random.Generator, times: FloatArray, distances: FloatArray
+) -> tuple[Walk, ...]:
+    """Draw people who stand in the view for 1.5-2.5 s, walk on and stand again.
 
-    Arguments and frame as in `crowd`.
+    Each stops at a time of their own. Arguments and frame are those of `crowd`.
     """
     walks = []
     for distance in distances:
-        line = errands(rng, times, 0.42 * float(distance), (1.5, 2.5), float(rng.uniform(0.6, 0.8)))
+        line = back_and_forth(
+            rng, times, 0.42 * float(distance), (1.5, 2.5), float(rng.uniform(0.6, 0.8))
+        )
         walk = walk_along(
             times, np.stack([line, np.full_like(line, distance)], 1), float(rng.uniform(0, 1.4))
         )
-        walks.append(replace(walk, heading=_turning(times, line)))
+        walks.append(replace(walk, heading=_turn_headings(times, line)))
     return tuple(walks)
 
 
-def _turning(times: Doubles, line: Doubles) -> Doubles:
-    """[n] rad: 0 while `line` [n] m rises, pi while it falls; the turn between is over when the way
-    begins.
+def _turn_headings(times: FloatArray, line: FloatArray) -> FloatArray:
+    """Return [n] rad: 0 while `line` [n] m rises, pi while it falls.
+
+    A turn is complete when the motion begins.
     """
     lead = round(_TURN / 2 / float(times[1] - times[0]))
     ways = np.sign(np.diff(line, append=line[-1]))
@@ -216,11 +254,14 @@ def _turning(times: Doubles, line: Doubles) -> Doubles:
     return _smooth(np.where(ways[moving[np.maximum(latest, 0)]] > 0, 0.0, np.pi), 2 * lead)
 
 
-def approach(times: Doubles, poses: Doubles) -> Walk:
-    """A person who comes up to the camera, stands before it for 3 tenths of the time, wherever it
-    moves, and goes.
+def approach_camera(times: FloatArray, poses: FloatArray) -> Walk:
+    """Return a person who comes up to the camera, stays before it wherever it moves, and leaves.
 
-    poses: [n, 4, 4] T_wc of the camera. World frame.
+    The person stays for 3 tenths of the time. World frame.
+
+    Args:
+        times: [n] s.
+        poses: [n, 4, 4] T_wc of the camera.
     """
     t = times / times[-1]
     step = float(times[1] - times[0])

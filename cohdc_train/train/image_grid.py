@@ -1,4 +1,4 @@
-"""Validation images beside each other: truth, prediction, and a list of what was found (OpenCV)."""
+"""Grid of validation images: truth, prediction, and a list of the detections (OpenCV)."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -7,35 +7,32 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from faster_coco_eval.core import mask as rle
-from numpy.typing import NDArray
 
 from cohdc_train.data.annotations import CocoImage
-from cohdc_train.data.doctor.sample_grid import read_fitted, tint, write_outlined
-from cohdc_train.metrics.coco_metrics import Row
+from cohdc_train.data.doctor.sample_grid import read_fitted
+from cohdc_train.drawing import Color, draw_outline, encode_jpeg, fill_mask, write_text
 from cohdc_train.metrics.matching import ImageMatch
-
-Image = NDArray[np.uint8]
-Colour = tuple[int, int, int]
+from cohdc_train.types import Image, Mask, Row
 
 _PANEL = (300, 400)  # px, height and width of truth and of prediction
 _LIST = 250  # px, width
 _LINE = 18  # px, height of a line of text
 _GAP = 6  # px
 _NUMBER = (20, 14)  # px, width and height
-_FILL = 0.35
-# BGR, of objects found as the right class; red and orange are kept for mistakes
-_COLOURS: tuple[Colour, ...] = (
-    (75, 180, 60),
-    (230, 160, 30),
-    (240, 240, 70),
-    (200, 60, 160),
-    (90, 220, 220),
+_OPACITY = 0.35
+# RGB, of objects found as the right class; red and orange are kept for mistakes
+_COLORS: tuple[Color, ...] = (
+    (60, 180, 75),
+    (30, 160, 230),
+    (70, 240, 240),
+    (160, 60, 200),
+    (220, 220, 90),
 )
-_MISTAKE: Colour = (60, 60, 255)
-_WRONG_CLASS: Colour = (0, 150, 255)
-_CROWD: Colour = (255, 255, 255)
-_INK: Colour = (230, 230, 230)
-_PAPER = 28  # grey value of the background
+_MISTAKE: Color = (255, 60, 60)
+_WRONG_CLASS: Color = (255, 150, 0)
+_CROWD: Color = (255, 255, 255)
+_INK: Color = (230, 230, 230)
+_PAPER = 28  # gray level of the background
 
 
 def draw_tiles(
@@ -45,34 +42,46 @@ def draw_tiles(
     names: Sequence[str],
     columns: int = 2,
 ) -> bytes:
-    """A JPEG of images, each with its truth on the left, its prediction in the middle and a list on
-    the right.
+    """Draw a grid of images: truth on the left, prediction in the middle, a list on the right.
 
-    An object and the detection that found it share number and colour; red: missed or false, orange:
-    found as another
-    class, white: crowd. images: by id. Raises DataError naming an image that cannot be read.
+    An object and the detection that matches it share number and color; red: missed or false,
+    orange: detected as another class, white: crowd.
+
+    Args:
+        title: first line of the grid.
+        matches: objects and detections of the images.
+        images: by id.
+        names: of the classes.
+        columns: images in a row.
+
+    Returns:
+        JPEG.
+
+    Raises:
+        DataError: an image cannot be read; the message names it.
     """
     tiles = [_tile(match, images[match.image_id], names) for match in matches]
     blank = _paper(_LINE + _PANEL[0] + _GAP, 2 * _PANEL[1] + _LIST + 3 * _GAP)
     tiles += [blank] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
-    legend = "left: truth, middle: predicted at class score >= 0.5; same number: found; red: missed or false"
+    legend = (
+        "left: truth, middle: predicted at class score >= 0.5; same number: found; "
+        "red: missed or false; orange: other class; white: crowd; q: predicted quality"
+    )
     head = _paper(3 * _LINE, columns * blank.shape[1])
-    for line, text in enumerate(
-        (title, legend + "; orange: other class; white: crowd; q: predicted quality")
-    ):
+    for line, text in enumerate((title, legend)):
         _write(head, text, (_GAP, (line + 1) * _LINE + 2), _INK, 0.5)
-    picture = np.vstack([head, *rows])
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
+    return encode_jpeg(np.vstack([head, *rows]))
 
 
 class _Entry(NamedTuple):
-    """A line of the list, and what carries its number. Misses have none: they share a line per
-    class.
+    """Line of the list, and the object and detection that carry its number.
+
+    Misses have no number: they share a line per class.
     """
 
     text: str
-    colour: Colour
+    color: Color
     object: Row | None
     detection: Row | None
 
@@ -82,12 +91,12 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
     predicted = truth.copy()
     entries = _entries(match, names)
     for row in match.crowds:
-        tint(truth, _mask(row, truth), _CROWD, _FILL)
+        _tint(truth, _mask(row, truth), _CROWD)
     for missed in match.missed():
-        tint(truth, _mask(missed, truth), _MISTAKE, _FILL)
-    _draw(truth, [(entry.object, entry.colour) for entry in entries])
-    _draw(predicted, [(entry.detection, entry.colour) for entry in entries])
-    right = int(match.right.sum())
+        _tint(truth, _mask(missed, truth), _MISTAKE)
+    _draw(truth, [(entry.object, entry.color) for entry in entries])
+    _draw(predicted, [(entry.detection, entry.color) for entry in entries])
+    right = int(match.is_correct.sum())
     counts = f"objects {len(match.objects)}, found {right}, false {len(match.detections) - right}"
     head = _paper(_LINE, 2 * _PANEL[1] + _LIST + 3 * _GAP)
     _write(
@@ -99,44 +108,50 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
     )
     gap = _paper(_PANEL[0], _GAP)
     body = np.hstack(
-        [gap, _centred(truth), gap, _centred(predicted), gap, _list(match, entries, names)]
+        [gap, _centered(truth), gap, _centered(predicted), gap, _list(match, entries, names)]
     )
     return np.vstack([head, body, _paper(_GAP, body.shape[1])])
 
 
-def _draw(shown: Image, rows: Sequence[tuple[Row | None, Colour]]) -> None:
-    """Masks, then on top of them their numbers, where there is room; they count the entries from 1."""
+def _draw(shown: Image, rows: Sequence[tuple[Row | None, Color]]) -> None:
+    """Draw masks, then on top of them their numbers where there is room; numbers count from 1."""
     masks = [None if row is None else _mask(row, shown) for row, _ in rows]
-    for mask, (_, colour) in zip(masks, rows, strict=True):
+    for mask, (_, color) in zip(masks, rows, strict=True):
         if mask is not None:
-            tint(shown, mask, colour, _FILL)
+            _tint(shown, mask, color)
     taken: list[tuple[int, int]] = []
     for number, mask in enumerate(masks, start=1):
         place = None if mask is None or not mask.any() else _free_place(mask, taken)
         if place is not None:
             taken.append(place)
-            write_outlined(shown, str(number), place, 0.5)
+            write_text(shown, str(number), place, 0.5)
+
+
+def _tint(shown: Image, mask: Mask, color: Color) -> None:
+    """Fill and outline a mask, in place."""
+    fill_mask(shown, mask, color, _OPACITY)
+    draw_outline(shown, mask, color)
 
 
 def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
-    """What was found, then false detections."""
+    """List matched detections, then false ones."""
     found: list[_Entry] = []
     for j, (i, o) in enumerate(match.pairs()):
         if i < 0:
             continue
         name = names[o["category_id"] - 1]
         detection = match.detections[i]
-        colour = _COLOURS[len(found) % len(_COLOURS)] if match.right[j] else _WRONG_CLASS
+        color = _COLORS[len(found) % len(_COLORS)] if match.is_correct[j] else _WRONG_CLASS
         seen = names[detection["category_id"] - 1]
-        what = seen if match.right[j] else f"{seen}, is {name}"
+        what = seen if match.is_correct[j] else f"{seen}, is {name}"
         found.append(
             _Entry(
-                f"{what} {_values(detection)} IoU {match.overlaps[i, j]:.2f}", colour, o, detection
+                f"{what} {_values(detection)} IoU {match.overlaps[i, j]:.2f}", color, o, detection
             )
         )
     false: list[_Entry] = []
     for i, row in enumerate(match.detections):
-        if i not in match.found:
+        if i not in match.detection_of:
             overlap = match.overlaps[i].max(initial=0.0)
             text = f"{names[row['category_id'] - 1]} {_values(row)} IoU {overlap:.2f} false"
             false.append(_Entry(text, _MISTAKE, None, row))
@@ -153,27 +168,28 @@ def _list(match: ImageMatch, entries: Sequence[_Entry], names: Sequence[str]) ->
     missed = Counter(names[row["category_id"] - 1] for row in match.missed())
     lines = [(f"missed: {count} {name}", _MISTAKE) for name, count in missed.items()]
     lines += [
-        (f"{number} {entry.text}", entry.colour) for number, entry in enumerate(entries, start=1)
+        (f"{number} {entry.text}", entry.color) for number, entry in enumerate(entries, start=1)
     ]
     if len(lines) > room:
         lines[room - 1 :] = [(f"and {len(lines) - room + 1} more", _INK)]
-    for k, (text, colour) in enumerate(lines):
-        _write(shown, text, (0, (k + 1) * _LINE - 5), colour, 0.42)
+    for k, (text, color) in enumerate(lines):
+        _write(shown, text, (0, (k + 1) * _LINE - 5), color, 0.42)
     return shown
 
 
-def _mask(row: Row, shown: Image) -> Image:
-    """A row's mask, [H, W] of 0 and 1, at the size at which its image is shown."""
+def _mask(row: Row, shown: Image) -> Mask:
+    """Return a row's mask, [H, W] bool, at the size at which its image is shown."""
     decoded = rle.decode(row["segmentation"])
-    return np.asarray(
-        cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8
-    )
+    resized = cv2.resize(decoded, shown.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized, np.bool_)
 
 
-def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
-    """(x, y) of a number's lower left corner: where the mask is widest, or just below or above when
-    a number stands there; None when there too."""
-    depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+def _free_place(mask: Mask, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
+    """Return (x, y) of a number's lower left corner; None where there is no room.
+
+    The place is where the mask is widest, or just below or above when a number stands there.
+    """
+    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     width, height = _NUMBER
     x = min(max(int(column) - width // 2, 0), max(mask.shape[1] - width, 0))
@@ -184,7 +200,7 @@ def _free_place(mask: Image, taken: Sequence[tuple[int, int]]) -> tuple[int, int
     return None
 
 
-def _centred(shown: Image) -> Image:
+def _centered(shown: Image) -> Image:
     panel = _paper(*_PANEL)
     top, left = ((panel.shape[k] - shown.shape[k]) // 2 for k in (0, 1))
     panel[top : top + shown.shape[0], left : left + shown.shape[1]] = shown
@@ -195,7 +211,7 @@ def _paper(height: int, width: int) -> Image:
     return np.full((height, width, 3), _PAPER, np.uint8)
 
 
-def _write(shown: Image, text: Any, place: tuple[int, int], ink: Colour, scale: float) -> None:
-    """OpenCV has letters for ASCII only; others become question marks."""
+def _write(shown: Image, text: Any, place: tuple[int, int], ink: Color, scale: float) -> None:
+    """Write text; OpenCV has letters for ASCII only, others become question marks."""
     plain = str(text).encode("ascii", "replace").decode()
     cv2.putText(shown, plain, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, 1, cv2.LINE_AA)

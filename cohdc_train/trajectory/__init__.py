@@ -1,1 +1,1 @@
-"""Trajectories, their association with ground truth, and their errors."""
+"""Trajectories: TUM files, association with ground truth, ATE and RPE."""

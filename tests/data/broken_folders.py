@@ -1,6 +1,4 @@
-"""Toy folders, each broken in one way on purpose: the finding that has to name it, and whether a
-mend saves it.
-"""
+"""Toy folders that are each broken in one way, with the issue that doctor has to find."""
 
 import copy
 import shutil
@@ -19,17 +17,21 @@ Change = Callable[[dict[str, Any], Path], None]
 
 
 class Broken(NamedTuple):
-    """change: breaks the training split's dict or files below the root; kind: the finding; mended:
-    `--fix` saves it.
+    """A way to break a folder.
+
+    Attributes:
+        change: breaks the training split's dict, or files below the root.
+        kind: the issue.
+        fixed: `--fix` removes the issue.
     """
 
     change: Change
     kind: str
-    mended: bool = True
+    fixed: bool = True
 
 
 def _set(index: int, **values: Any) -> Change:
-    """Values of an annotation."""
+    """Set values of an annotation."""
     return lambda content, root: content["annotations"][index].update(values)
 
 
@@ -42,7 +44,7 @@ def _add(key: str, row: Any) -> Change:
 
 
 def _again(key: str, **values: Any) -> Change:
-    """The first row once more, with other values."""
+    """Repeat the first row with other values."""
     return lambda content, root: content[key].append(content[key][0] | values)
 
 
@@ -56,17 +58,15 @@ def _cut(path: Path) -> None:
 
 
 def _jpeg(turned: int = 1, mode: str = "RGB", cut: int = 0) -> Change:
-    """Replace the first training image by a JPEG with an EXIF orientation, of a mode, or cut at its
-    end.
-    """
+    """Replace the first training image by a JPEG: turned by EXIF, of a mode, or truncated."""
 
     def change(content: dict[str, Any], root: Path) -> None:
         row = content["images"][0]
-        picture = Image.open(root / "images" / row["file_name"]).convert(mode)
+        image_file = Image.open(root / "images" / row["file_name"]).convert(mode)
         row["file_name"] = "shot.jpg"
         exif = Image.Exif()
         exif[0x0112] = turned
-        picture.save(root / "images" / "shot.jpg", exif=exif, quality=95)
+        image_file.save(root / "images" / "shot.jpg", exif=exif, quality=95)
         path = root / "images" / "shot.jpg"
         path.write_bytes(path.read_bytes()[: len(path.read_bytes()) - cut])
 
@@ -74,19 +74,17 @@ def _jpeg(turned: int = 1, mode: str = "RGB", cut: int = 0) -> Change:
 
 
 def _turned_by_exif(content: dict[str, Any], root: Path) -> None:
-    """The annotations are drawn on the picture as viewers show it: HEIGHT x WIDTH; the pixels lie
-    on their side.
-    """
+    """Annotate the image as viewers show it, HEIGHT x WIDTH, while its pixels are turned."""
     row = content["images"][0]
-    picture = Image.open(root / "images" / row["file_name"]).transpose(Image.Transpose.ROTATE_90)
+    image_file = Image.open(root / "images" / row["file_name"]).transpose(Image.Transpose.ROTATE_90)
     exif = Image.Exif()
     exif[0x0112] = 6
-    picture.save(root / "images" / "shot.jpg", exif=exif)
+    image_file.save(root / "images" / "shot.jpg", exif=exif)
     row["file_name"] = "shot.jpg"
 
 
 def _swapped_size(content: dict[str, Any], root: Path) -> None:
-    """Width and height changed places in the JSON; the contours fit the file."""
+    """Swap width and height in the JSON; the contours fit the file."""
     content["images"][0].update(width=HEIGHT, height=WIDTH)
 
 
@@ -96,7 +94,7 @@ def _resized(content: dict[str, Any], root: Path) -> None:
 
 
 def _leak(content: dict[str, Any], root: Path) -> None:
-    """A validation image again among the training images, mirrored and a little brighter."""
+    """Add a validation image to the training images, mirrored and a little brighter."""
     shown = cv2.imread(str(root / "images" / "val_1.png"))
     name = content["images"][0]["file_name"]
     cv2.imwrite(str(root / "images" / name), cv2.add(shown[:, ::-1].copy(), (9, 9, 9, 0)))
@@ -160,9 +158,9 @@ BROKEN: dict[str, Broken] = {
     ),
     "two ids for one name": Broken(_second_person, "category-name-twice"),
     "category nobody uses": Broken(
-        _add("categories", {"id": 30, "name": "cart"}), "classes-differ", mended=False
+        _add("categories", {"id": 30, "name": "cart"}), "classes-differ", fixed=False
     ),
-    "class of one split only": Broken(_class_only_in_train, "classes-differ", mended=False),
+    "class of one split only": Broken(_class_only_in_train, "classes-differ", fixed=False),
     "image without a width": Broken(lambda c, r: c["images"][0].pop("width"), "image-broken"),
     "image id twice": Broken(_again("images", file_name="train_2.png"), "image-id-twice"),
     "image file listed twice": Broken(_listed_twice, "image-listed-twice"),
@@ -176,7 +174,7 @@ BROKEN: dict[str, Broken] = {
     "JPEG turned by EXIF": Broken(_turned_by_exif, "image-turned"),
     "JPEG upside down by EXIF": Broken(_jpeg(turned=3), "image-turned"),
     "JPEG of EXIF, annotated unturned": Broken(_jpeg(turned=6), "image-exif"),
-    "CMYK": Broken(_jpeg(mode="CMYK"), "image-colour"),
+    "CMYK": Broken(_jpeg(mode="CMYK"), "image-color"),
     "width and height swapped": Broken(_swapped_size, "image-size"),
     "image resized, annotations not": Broken(_resized, "image-size"),
     "image of 48 megapixels": Broken(_huge, "image-huge"),
@@ -247,7 +245,7 @@ BROKEN: dict[str, Broken] = {
     ),
     "crowd": Broken(_set(0, iscrowd=1), "crowd"),
     "crowd as text": Broken(_set(0, iscrowd="1"), "crowd"),
-    "validation image in train": Broken(_leak, "leak", mended=False),
+    "validation image in train": Broken(_leak, "leak", fixed=False),
 }
 
 
@@ -261,6 +259,6 @@ def build(root: Path, name: str) -> Path:
 
 
 def whole(root: Path) -> Path:
-    """The same folder, sound."""
+    """Draw the same folder without a fault."""
     shutil.rmtree(root, ignore_errors=True)
     return toys.folder(root)

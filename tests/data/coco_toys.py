@@ -1,4 +1,4 @@
-"""Toy COCO-format folders, drawn: coloured rectangles on noise."""
+"""Toy COCO-format folders, drawn: colored rectangles on noise."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 
 HEIGHT, WIDTH = 48, 64
 CATEGORIES = [{"id": 20, "name": "car"}, {"id": 10, "name": "person"}]
-COLOURS = {10: (250, 60, 60), 20: (60, 60, 250)}  # RGB
+COLORS = {10: (250, 60, 60), 20: (60, 60, 250)}  # RGB
 
 
 def rectangle(
@@ -32,14 +32,15 @@ def draw_image(path: Path, rows: list[dict[str, Any]], seed: int) -> None:
     pixels = np.random.default_rng(seed).integers(0, 100, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     for row in rows:
         x, y, w, h = (int(v) for v in row["bbox"])
-        pixels[y : y + h, x : x + w] = COLOURS.get(row["category_id"], (0, 200, 0))
+        pixels[y : y + h, x : x + w] = COLORS.get(row["category_id"], (0, 200, 0))
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), pixels[:, :, ::-1])
 
 
 def content(images: Path, name: str, count: int) -> dict[str, Any]:
-    """`count` images, each with a person and a car; draws them into the folder. Those of "val" look
-    different.
+    """Draw `count` images with a person and a car each, and return their COCO dict.
+
+    Those of "val" look different.
     """
     rows, files = [], []
     other = name == "val"
@@ -64,7 +65,7 @@ def write(path: Path, value: Any) -> Path:
 
 
 def folder(root: Path, train: int = 6, val: int = 2) -> Path:
-    """`images/` + `instances_{train,val}.json`."""
+    """Write `images/` and `instances_{train,val}.json`."""
     for name, count in (("train", train), ("val", val)):
         write(root / f"instances_{name}.json", content(root / "images", name, count))
     return root

@@ -1,4 +1,4 @@
-"""What the tests of `cohdc data convert` share."""
+"""Helpers of the tests of `cohdc data convert`."""
 
 import json
 from pathlib import Path
@@ -19,14 +19,14 @@ FORMATS = tuple(BUILD)
 
 
 def converted(format: Any, source: Path, **options: Any) -> dict[str, CocoSplit]:
-    """Both splits of the folder it is converted to, beside the source."""
+    """Convert a source, and return both splits of the new folder."""
     out = source.with_name(f"{source.name}_coco")
     convert(format, source, out, **options)
     return {name: read_split(name, find_split(out, name)) for name in ("train", "val")}
 
 
 def image_of(splits: dict[str, CocoSplit], name: str) -> CocoImage:
-    """The image of this file name, whichever split it is in."""
+    """Return the image of this file name, from either split."""
     (found,) = [
         image for split in splits.values() for image in split.images if image.path.stem == name
     ]
@@ -34,7 +34,7 @@ def image_of(splits: dict[str, CocoSplit], name: str) -> CocoImage:
 
 
 def masks_of(splits: dict[str, CocoSplit], name: str) -> list[tuple[str, NDArray[np.uint8]]]:
-    """(class, mask) of the objects of an image."""
+    """Return (class, mask) of the objects of an image."""
     image = image_of(splits, name)
     names = splits["train"].class_names
     return [(names[o.label - 1], o.mask(image.height, image.width)) for o in image.objects]
@@ -43,7 +43,7 @@ def masks_of(splits: dict[str, CocoSplit], name: str) -> list[tuple[str, NDArray
 def drawn(
     *polygons: list[float], size: tuple[int, int] = (toys.HEIGHT, toys.WIDTH)
 ) -> NDArray[np.uint8]:
-    """The mask of polygons."""
+    """Return the mask of polygons."""
     return CocoObject(1, 1, (0, 0, 1, 1), 1, list(polygons), False).mask(*size)
 
 
@@ -55,8 +55,8 @@ def file_names(split: CocoSplit) -> list[str]:
     return [row["file_name"] for row in json.loads(split.annotations.read_text())["images"]]
 
 
-def refused(tmp_path: Path, format: Any, source: Path, message: str, **options: Any) -> None:
-    """It is said in one line, and nothing is written."""
+def assert_refused(tmp_path: Path, format: Any, source: Path, message: str, **options: Any) -> None:
+    """Assert that converting ends in an error of one line and writes nothing."""
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(DataError, match=message) as caught:
         convert(format, source, tmp_path / "out", **options)

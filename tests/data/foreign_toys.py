@@ -1,4 +1,4 @@
-"""Toy folders in other annotation formats, written by hand: two classes on four pictures of noise."""
+"""Toy folders in other annotation formats, written by hand: two classes, four images of noise."""
 
 import base64
 import io
@@ -17,8 +17,10 @@ PERSON = [5.0, 4.0, 25.0, 6.0, 22.0, 30.0, 7.0, 28.0]  # a polygon, px
 CAR = (30, 20, 54, 34)  # x0 y0 x1 y1, px
 
 
-def picture(path: Path, seed: int, size: tuple[int, int] = (HEIGHT, WIDTH), exif: int = 1) -> Path:
-    """Noise; exif: the orientation a JPEG says it has."""
+def draw_image(
+    path: Path, seed: int, size: tuple[int, int] = (HEIGHT, WIDTH), exif: int = 1
+) -> Path:
+    """Write an image of noise. exif: the orientation that a JPEG gets."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(0, 255, (*size, 3), dtype=np.uint8)
     tags = Image.Exif()
@@ -34,14 +36,14 @@ def write(path: Path, content: Any) -> Path:
 
 
 def box_mask(x0: int, y0: int, x1: int, y1: int) -> NDArray[np.uint8]:
-    """[HEIGHT, WIDTH], 1 inside."""
+    """Return [HEIGHT, WIDTH], 1 inside the box."""
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[y0:y1, x0:x1] = 1
     return mask
 
 
 def disk_mask(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> NDArray[np.uint8]:
-    """[HEIGHT, WIDTH], 1 where a pixel's centre is inside of the ellipse."""
+    """Return [HEIGHT, WIDTH], 1 where a pixel's center lies inside the ellipse."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     along = (x - cx) * np.cos(theta) + (y - cy) * np.sin(theta)
     across = (y - cy) * np.cos(theta) - (x - cx) * np.sin(theta)
@@ -59,7 +61,7 @@ def points(flat: list[float]) -> list[list[float]]:
 
 
 def shape(label: str, kind: str, flat: list[float], **more: Any) -> dict[str, Any]:
-    """One of labelme's shapes."""
+    """Return one of labelme's shapes."""
     return {
         "label": label,
         "points": points(flat),
@@ -83,7 +85,7 @@ def labelme_file(path: Path, shapes: list[Any], image: str | None = None, **more
 
 def labelme(root: Path) -> Path:
     for seed, name in enumerate(NAMES):
-        picture(root / f"{name}.png", seed)
+        draw_image(root / f"{name}.png", seed)
         labelme_file(
             root / f"{name}.json",
             [shape("person", "polygon", PERSON), shape("car", "rectangle", [30, 20, 54, 34])],
@@ -92,7 +94,7 @@ def labelme(root: Path) -> Path:
 
 
 def region(kind: str, attributes: dict[str, Any], **shape_attributes: Any) -> dict[str, Any]:
-    """One of VIA's regions."""
+    """Return one of VIA's regions."""
     return {"shape_attributes": {"name": kind} | shape_attributes, "region_attributes": attributes}
 
 
@@ -105,10 +107,10 @@ def person_and_car(key: str = "kind") -> list[dict[str, Any]]:
 
 
 def via(root: Path, regions: list[dict[str, Any]] | None = None) -> Path:
-    """A 2.x export."""
+    """Write an export of VIA 2."""
     content = {}
     for seed, name in enumerate(NAMES):
-        picture(root / f"{name}.png", seed)
+        draw_image(root / f"{name}.png", seed)
         own = regions if regions is not None and name == "a" else person_and_car()
         content[f"{name}.png99"] = {
             "filename": f"{name}.png",
@@ -131,7 +133,7 @@ def yolo(
     write(root / "data.yaml", yaml)
     for seed, name in enumerate(NAMES):
         split = "val" if name == "d" else "train"
-        picture(root / "images" / split / f"{name}.png", seed)
+        draw_image(root / "images" / split / f"{name}.png", seed)
         x0, y0, x1, y1 = CAR
         rows = [yolo_row(0, PERSON), yolo_row(1, [x0, y0, x1, y0, x1, y1, x0, y1])]
         write(root / "labels" / split / f"{name}.txt", "\n".join(rows) + "\n")
@@ -141,20 +143,21 @@ def yolo(
 def palette_png(path: Path, values: NDArray[Any]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     image = Image.fromarray(values.astype(np.uint8))
-    image.putpalette([value for i in range(256) for value in voc_colour(i)])
+    image.putpalette([value for i in range(256) for value in voc_color(i)])
     image.save(path)
     return path
 
 
-def voc_colour(index: int) -> tuple[int, int, int]:
-    """By the devkit's formula, for the first classes and void."""
+def voc_color(index: int) -> tuple[int, int, int]:
+    """Return the color of a class by the formula of the devkit."""
     known = {0: (0, 0, 0), 1: (128, 0, 0), 2: (0, 128, 0), 7: (128, 128, 128), 15: (192, 128, 128)}
     return known.get(index, (224, 224, 192) if index == 255 else (index, 3, 5))
 
 
 def voc_labels(void: bool = True) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Pixels of objects (1 person, 2 car) and of VOC's classes (15, 7), with a void line around the
-    car.
+    """Return pixels of objects (1 person, 2 car) and of VOC's classes (15, 7).
+
+    A void line runs around the car.
     """
     x0, y0, x1, y1 = CAR
     objects = box_mask(5, 4, 25, 30) + 2 * box_mask(*CAR)
@@ -167,7 +170,7 @@ def voc_labels(void: bool = True) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 def voc(root: Path) -> Path:
     for seed, name in enumerate(NAMES):
-        picture(root / "JPEGImages" / f"{name}.jpg", seed)
+        draw_image(root / "JPEGImages" / f"{name}.jpg", seed)
         objects, classes = voc_labels()
         palette_png(root / "SegmentationObject" / f"{name}.png", objects)
         palette_png(root / "SegmentationClass" / f"{name}.png", classes)

@@ -1,4 +1,4 @@
-"""Canvas from image sizes."""
+"""Canvas size chosen from image sizes."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +8,7 @@ from cohdc_train.data.canvas import GRID_PX, MAX_AREA_PX, choose_canvas
 sides = st.integers(1, 6000)
 
 
-def test_canvas_of_usual_sets() -> None:
+def test_canvas_follows_median_size() -> None:
     assert choose_canvas([(416, 416)] * 3) == (416, 416)
     assert choose_canvas([(480, 640)] * 3) == (480, 640)
     assert choose_canvas([(1080, 1920)]) == (416, 736)

@@ -10,10 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import SlamConfig
 from cohdc_train.slam.features.keypoints import Features
+from cohdc_train.slam.frame import FrameResult, PoseCallback, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import exp_se3
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.slam.system import Slam
+from cohdc_train.trajectory.trajectory import Trajectory
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
 CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\ndepth_scale: 5000\n"
@@ -137,6 +140,25 @@ def render(
     return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
 
 
+def slam_config(max_keypoints: int, **options: object) -> SlamConfig:
+    """Options with few keypoints; two underscores stand for a dot: loops__enabled=False."""
+    dotted = {name.replace("__", "."): value for name, value in options.items()}
+    return SlamConfig().override({"features.max_keypoints": max_keypoints, **dotted})
+
+
+def track(
+    slam: Slam,
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    timestamp: float,
+    mask: NDArray[np.bool_] | None = None,
+    depth_timestamp: float | None = None,
+    on_pose: PoseCallback | None = None,
+) -> FrameResult:
+    """Track a frame given as arrays."""
+    return slam.track(RGBDFrame(timestamp, rgb, depth, depth_timestamp), mask, on_pose)
+
+
 def features_at(pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> Features:
     """Corners of the finest level at pixels [n, 2] px, free of distortion, and depths [n] m, that
     look like nothing.
@@ -171,5 +193,5 @@ def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> P
         (folder / f"{name}.txt").write_text("# stamp file\n" + "\n".join(lines) + "\n")
     (folder / "camera.yaml").write_text(CAMERA_YAML)
     stamps = np.array([float(line.split()[0]) for line in rows["rgb"]])
-    write_tum(folder / "groundtruth.txt", Trajectory(stamps, poses))
+    Trajectory(stamps, poses).save_tum(folder / "groundtruth.txt")
     return folder

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from cohdc_train.slam.config import SlamConfig
 from cohdc_train.slam.run import slam
 
 SEQUENCE = Path(__file__).parents[3] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
@@ -13,7 +14,7 @@ SEQUENCE = Path(__file__).parents[3] / "shared" / "data" / "tum" / "rgbd_dataset
 @pytest.mark.skipif(not SEQUENCE.is_dir(), reason="freiburg1_xyz is not in ../shared/data/tum")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_freiburg1_xyz(seed: int, tmp_path: Path) -> None:
-    metrics = slam(sequence=SEQUENCE, out=tmp_path / "run", seed=seed)
+    metrics = slam(SEQUENCE, out=tmp_path / "run", settings=SlamConfig(seed=seed))
     assert metrics["frames"] == 792
     assert metrics["without_depth"] == 6
     assert metrics["coverage"] == 1.0

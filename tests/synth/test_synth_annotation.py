@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cohdc_train.synth.coco_annotation import annotate, outlines, run_lengths
+from cohdc_train.contour import pixel_borders
+from cohdc_train.synth.coco_annotation import annotate, run_lengths
 
 mask_api = pytest.importorskip("pycocotools.mask")
 # pycocotools' arrays lack numpy 2's copy keyword
@@ -23,7 +24,7 @@ def decoded(segmentation: Any, shape: tuple[int, int]) -> np.ndarray:
 
 @settings(max_examples=150, deadline=None)
 @given(mask=arrays(bool, st.tuples(st.integers(2, 14), st.integers(2, 14))))
-def test_any_mask_survives(mask: np.ndarray) -> None:
+def test_any_mask_is_annotated_exactly(mask: np.ndarray) -> None:
     np.testing.assert_array_equal(decoded(run_lengths(mask), mask.shape), mask)
     if mask.any():
         annotation = annotate(mask, 3, 9)
@@ -41,10 +42,10 @@ def test_simple_parts_are_polygons_and_holes_are_runs() -> None:
     mask = np.zeros((8, 12), dtype=bool)
     mask[1:3, 1:4] = True
     mask[5:7, 6:11] = True
-    assert outlines(mask) is not None
-    assert sorted(len(p) for p in outlines(mask) or []) == [8, 8]
+    assert pixel_borders(mask) is not None
+    assert sorted(len(p) for p in pixel_borders(mask) or []) == [8, 8]
     assert isinstance(annotate(mask, 1, 1)["segmentation"], list)
     ring = np.ones((5, 5), dtype=bool)
     ring[2, 2] = False
-    assert outlines(ring) is None
+    assert pixel_borders(ring) is None
     assert annotate(ring, 1, 1)["segmentation"] == {"size": [5, 5], "counts": [0, 12, 1, 12]}

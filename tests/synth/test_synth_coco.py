@@ -1,6 +1,4 @@
-"""The COCO-format set: readable by pycocotools, exact, reproducible, with splits that share
-nothing.
-"""
+"""COCO-format sets: readable by pycocotools, exact, repeatable, with disjoint splits."""
 
 import hashlib
 import json
@@ -12,7 +10,7 @@ import pytest
 
 from cohdc_train.errors import DataError
 from cohdc_train.synth import coco
-from cohdc_train.synth.coco import SMALLEST_SHARE, Picture, draw_stage, take_picture
+from cohdc_train.synth.coco import SMALLEST_SHARE, LabeledImage, draw_populated_room, render_image
 from cohdc_train.synth.coco_annotation import annotate
 from cohdc_train.synth.random_streams import stream
 
@@ -63,7 +61,7 @@ def test_layout_and_loading(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert people >= 10
 
 
-def test_crumbs_of_people_are_a_crowd_that_scores_ignore() -> None:
+def test_small_parts_of_people_are_annotated_as_crowd() -> None:
     mask = np.zeros((40, 50), dtype=np.bool_)
     mask[3:5, 4:8] = True
     crumb = annotate(mask, 1, 1, crowd=True)
@@ -75,16 +73,16 @@ def test_crumbs_of_people_are_a_crowd_that_scores_ignore() -> None:
 
 def test_annotations_are_the_rendered_masks(folder: Path) -> None:
     rng = stream(5, "coco-train", 0)
-    from cohdc_train.synth.room import texture_detail
+    from cohdc_train.synth.room_layouts import texture_detail
 
-    stage = draw_stage(rng, texture_detail(SIZE))
+    room_with_people = draw_populated_room(rng, texture_detail(SIZE))
     api = pycocotools.COCO(folder / "instances_train.json")
     seen = 0
     for image_id in (1, 2, 3, 4, 5):
-        picture: Picture = take_picture(stage, rng, SIZE)
+        rendered: LabeledImage = render_image(room_with_people, rng, SIZE)
         annotations = api.loadAnns(sorted(api.getAnnIds(image_id)))
-        assert len(annotations) == len(picture.masks)
-        for annotation, mask in zip(annotations, picture.masks, strict=True):
+        assert len(annotations) == len(rendered.masks)
+        for annotation, mask in zip(annotations, rendered.masks, strict=True):
             np.testing.assert_array_equal(api.annToMask(annotation).astype(bool), mask)
             seen += 1
     assert seen > 0
@@ -98,7 +96,7 @@ def test_same_seed_same_bytes_and_another_seed_differs(tmp_path: Path) -> None:
     assert all(first[name] != other[name] for name in first)
 
 
-def test_people_who_are_near_fill_more_of_the_picture(folder: Path, tmp_path: Path) -> None:
+def test_near_people_cover_more_of_the_image(folder: Path, tmp_path: Path) -> None:
     """The same rooms and people, at .45 to 1.3 m instead of .7 to 3.7 m."""
     coco(tmp_path / "near", train=10, val=1, size=SIZE, seed=5, distance=(0.45, 1.3))
     shares = []
@@ -112,7 +110,7 @@ def test_people_who_are_near_fill_more_of_the_picture(folder: Path, tmp_path: Pa
 
 def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
     keys = [("coco-train", 0), ("coco-train", 1), ("coco-val", 0), ("coco-val", 1), ("sequence", 0)]
-    stages = [draw_stage(stream(0, *key), 128) for key in keys]
+    stages = [draw_populated_room(stream(0, *key), 128) for key in keys]
     for i, a in enumerate(stages):
         for b in stages[:i]:
             assert a.room.size != b.room.size
@@ -139,7 +137,7 @@ def test_rooms_of_the_splits_and_of_the_sequence_differ() -> None:
         ({"distance": (0.5, float("inf"))}, "distance: 0.5 to inf m"),
     ],
 )
-def test_bad_arguments_in_one_line(
+def test_invalid_arguments_are_refused_in_one_line(
     tmp_path: Path, arguments: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DataError, match=message) as caught:

@@ -1,6 +1,4 @@
-"""Camera paths and walks: smooth, within their reach, out of sight when they jump, at rest when
-they should be.
-"""
+"""Camera paths and walks: smooth, within their reach, and out of sight when they jump."""
 
 import numpy as np
 import pytest
@@ -8,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cohdc_train.synth.camera_motion import MOTIONS, camera_path, loop_heading
-from cohdc_train.synth.walk_paths import approach, crowd, errands, led_round, rolled, stop_and_go
+from cohdc_train.synth.walk_paths import (
+    approach_camera,
+    back_and_forth,
+    cart_path,
+    crowd,
+    follow_camera,
+    stop_and_go,
+)
 
 TIMES = np.arange(300) / 30
 
@@ -44,20 +49,20 @@ def test_camera_moves_smoothly_about_the_eye(motion: str) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), people=st.integers(1, 4))
-def test_a_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: int) -> None:
+def test_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: int) -> None:
     distances = 1.2 + 0.35 * np.arange(people)
     ways = crowd(np.random.default_rng(seed), TIMES, distances, 0.85)
     assert len(ways) == people
     for way, distance in zip(ways, distances, strict=True):
         assert way.position.shape == (300, 2)
-        assert way.heading.shape == way.travelled.shape == way.pace.shape == (300,)
+        assert way.heading.shape == way.distance_walked.shape == way.pace.shape == (300,)
         step = np.linalg.norm(np.diff(way.position, axis=0), axis=1)
         jumps = np.flatnonzero(step > 1.3 / 30)
         assert len(jumps) <= 3
         for k in (*jumps, *(jumps + 1)):
             assert abs(way.position[k, 0]) > 0.62 * distance + 0.7, "out of sight of a still camera"
-        assert np.all(np.diff(way.travelled) >= 0)
-        assert np.diff(way.travelled).max() < 1.3 / 30
+        assert np.all(np.diff(way.distance_walked) >= 0)
+        assert np.diff(way.distance_walked).max() < 1.3 / 30
         assert np.abs(way.position[:, 1] - distance).max() < 0.1
         velocity = np.diff(way.position, axis=0)
         walking = (step > 0.005) & (step < 1.3 / 30)
@@ -73,13 +78,13 @@ def test_a_crowd_walks_steadily_and_jumps_only_out_of_sight(seed: int, people: i
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Degrees between two rotations."""
+    """Return the degrees between two rotations."""
     return float(np.degrees(np.arccos(np.clip((np.trace(first.T @ second) - 1) / 2, -1, 1))))
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_a_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
+def test_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
     times = np.arange(400) / 30
     eye = np.array([0.0, 3.5, 1.4])
     poses = camera_path(np.random.default_rng(seed), times, "loop", eye)
@@ -100,11 +105,13 @@ def test_a_loop_turns_all_round_and_ends_where_it_began(seed: int) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000), people=st.integers(1, 4))
-def test_a_crowd_led_round_stays_as_far_from_the_camera_as_it_was(seed: int, people: int) -> None:
+def test_crowd_following_camera_keeps_its_distance(seed: int, people: int) -> None:
     rng = np.random.default_rng(seed)
     eyes = camera_path(rng, TIMES, "loop", np.zeros(3))[:, :2, 3]
     ways = crowd(rng, TIMES, 1.2 + 0.35 * np.arange(people), 0.75)
-    for before, after in zip(ways, led_round(ways, TIMES, eyes, loop_heading(TIMES)), strict=True):
+    for before, after in zip(
+        ways, follow_camera(ways, TIMES, eyes, loop_heading(TIMES)), strict=True
+    ):
         np.testing.assert_allclose(
             np.linalg.norm(after.position - eyes, axis=1), before.position[:, 1]
         )
@@ -139,10 +146,10 @@ def test_people_stop_for_seconds_in_the_view_and_walk_on(seed: int, people: int)
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_a_cart_rolls_to_and_fro_and_its_pusher_stays_behind_it(seed: int) -> None:
+def test_cart_moves_back_and_forth_with_pusher_behind(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    line = errands(rng, TIMES, 1.2, (0.5, 1.0), 0.7)
-    cart, pusher = rolled(rng, TIMES, line, -1.0)
+    line = back_and_forth(rng, TIMES, 1.2, (0.5, 1.0), 0.7)
+    cart, pusher = cart_path(rng, TIMES, line, -1.0)
     assert np.all(line[:10] == line[0]), "at rest in the beginning"
     assert np.ptp(line) > 1.2
     assert line.max() <= 1.2
@@ -150,13 +157,13 @@ def test_a_cart_rolls_to_and_fro_and_its_pusher_stays_behind_it(seed: int) -> No
     ahead = np.array([np.cos(cart.heading[0]), np.sin(cart.heading[0])])
     np.testing.assert_allclose(cart.position - pusher.position, np.tile(ahead, (300, 1)), atol=1e-9)
     np.testing.assert_allclose(
-        np.diff(pusher.travelled), np.diff(cart.position, axis=0) @ ahead, atol=1e-9
+        np.diff(pusher.distance_walked), np.diff(cart.position, axis=0) @ ahead, atol=1e-9
     )
 
 
-def test_who_comes_up_to_the_camera_stays_before_it_wherever_it_moves() -> None:
+def test_approaching_person_stays_before_moving_camera() -> None:
     poses = camera_path(np.random.default_rng(3), TIMES, "xyz", np.zeros(3))
-    way = approach(TIMES, poses)
+    way = approach_camera(TIMES, poses)
     offset = way.position - poses[:, :2, 3]
     near = slice(int(0.43 * 300), int(0.63 * 300))
     assert np.all(np.linalg.norm(offset[near], axis=1) < 0.6)

@@ -1,4 +1,4 @@
-"""Bodies: on the floor, as tall as they say, articulated, facing outwards."""
+"""Bodies: on the floor, of the right height, articulated, with outward normals."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def person() -> Person:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_any_body_in_any_pose_stands_on_the_floor(seed: int) -> None:
+def test_body_in_any_pose_stands_on_floor(seed: int) -> None:
     rng = np.random.default_rng(seed)
     someone, pose = draw_person(rng), draw_pose(rng)
     mesh = person_mesh(someone, pose, (1.0, -2.0), 0.7)

@@ -1,24 +1,24 @@
-"""The sensor model: the noise it says, holes where it says."""
+"""Sensor model: noise and holes."""
 
 import numpy as np
 import pytest
 
-from cohdc_train.synth.renderer import View
+from cohdc_train.synth.renderer import RenderedView
 from cohdc_train.synth.sensor import (
     DEPTH_SCALE,
+    add_sensor_noise,
+    blur_motion,
     depth_edges,
-    exposure,
+    exposure_gain,
     measure_depth,
-    photograph,
-    smear,
 )
 
 
-def flat_view(depth: np.ndarray, facing: float = 1.0) -> View:
+def flat_view(depth: np.ndarray, facing: float = 1.0) -> RenderedView:
     shape = depth.shape
-    grey = np.full((*shape, 3), 0.5, np.float32)
-    return View(
-        grey,
+    gray = np.full((*shape, 3), 0.5, np.float32)
+    return RenderedView(
+        gray,
         depth.astype(np.float32),
         np.zeros(shape, np.int32),
         np.full(shape, facing, np.float32),
@@ -55,27 +55,27 @@ def test_edges_and_grazing_surfaces_lose_readings() -> None:
     assert (grazing == 0).mean() == pytest.approx(0.8, abs=0.05)
 
 
-def test_photograph_adds_the_noise_it_says() -> None:
+def test_sensor_noise_has_given_sigma() -> None:
     rgb = np.full((100, 120, 3), 0.5, np.float32)
-    image = photograph(rgb, np.random.default_rng(0), sigma=2.5)
+    image = add_sensor_noise(rgb, np.random.default_rng(0), sigma=2.5)
     assert image.dtype == np.uint8
     assert image.mean() == pytest.approx(127.5, abs=0.1)
     assert image.std() == pytest.approx(2.5, rel=0.03)
-    assert photograph(rgb * 9, np.random.default_rng(0)).min() > 240
+    assert add_sensor_noise(rgb * 9, np.random.default_rng(0)).min() > 240
 
 
-def test_smear_runs_along_its_angle_and_keeps_the_light() -> None:
+def test_motion_blur_follows_angle_and_keeps_brightness() -> None:
     image = np.zeros((21, 21, 3), np.float32)
     image[10, 10] = 1
-    wide = smear(image, 7, 0.0)
+    wide = blur_motion(image, 7, 0.0)
     assert wide[10, :, 0].sum() == pytest.approx(1, abs=1e-5)
     assert np.count_nonzero(wide[10, :, 0]) == 7
-    tall = smear(image, 7, np.pi / 2)
+    tall = blur_motion(image, 7, np.pi / 2)
     np.testing.assert_allclose(tall[:, 10], wide[10], atol=1e-6)
-    np.testing.assert_array_equal(smear(image, 0.4, 0.0), image)
+    np.testing.assert_array_equal(blur_motion(image, 0.4, 0.0), image)
 
 
-def test_exposure_brings_any_light_to_one_brightness() -> None:
+def test_exposure_gain_gives_one_brightness() -> None:
     rgb = np.random.default_rng(0).uniform(0.1, 0.3, (40, 50, 3)).astype(np.float32)
     for light in (0.2, 1.0, 7.0):
-        assert (rgb * light * exposure(rgb * light)).mean() == pytest.approx(0.37, rel=0.05)
+        assert (rgb * light * exposure_gain(rgb * light)).mean() == pytest.approx(0.37, rel=0.05)

@@ -1,4 +1,4 @@
-"""The RGB-D sequence: TUM's layout to the letter, and truth that agrees with the pixels."""
+"""RGB-D sequences: TUM's layout, and ground truth that agrees with the pixels."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ def rows(path: Path) -> list[list[str]]:
     return [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
 
 
-def test_layout(folder: Path) -> None:
+def test_sequence_has_files_of_tum_layout(folder: Path) -> None:
     names = {p.name for p in folder.iterdir()}
     assert names == {
         *(
@@ -69,10 +69,11 @@ def test_layout(folder: Path) -> None:
         listed = rows(folder / f"{kind}.txt")
         assert len(listed) == FRAMES
         assert all(
-            name == f"{kind}/{stamp}.png" and (folder / name).is_file() for stamp, name in listed
+            name == f"{kind}/{timestamp}.png" and (folder / name).is_file()
+            for timestamp, name in listed
         )
-        stamps = np.array([float(stamp) for stamp, _ in listed])
-        np.testing.assert_allclose(np.diff(stamps), 1 / 30, atol=2e-6)
+        timestamps = np.array([float(timestamp) for timestamp, _ in listed])
+        np.testing.assert_allclose(np.diff(timestamps), 1 / 30, atol=2e-6)
     assert listed[0][0] == "1305031102.175304"
     truth = (folder / "groundtruth.txt").read_text().splitlines()
     assert truth[0] == "# ground truth trajectory"
@@ -80,10 +81,12 @@ def test_layout(folder: Path) -> None:
     values = np.array(rows(folder / "groundtruth.txt"), dtype=float)
     assert values.shape == (3 * (FRAMES - 1) + 1, 8)
     np.testing.assert_allclose(np.linalg.norm(values[:, 4:], axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(values[::3, 0], [float(stamp) for stamp, _ in listed], atol=2e-6)
+    np.testing.assert_allclose(
+        values[::3, 0], [float(timestamp) for timestamp, _ in listed], atol=2e-6
+    )
 
 
-def test_camera_file(folder: Path) -> None:
+def test_camera_file_has_intrinsics(folder: Path) -> None:
     camera = yaml.safe_load((folder / "camera.yaml").read_text())
     assert set(camera) == {"fx", "fy", "cx", "cy", "width", "height", "depth_scale"}
     assert camera["fx"] == pytest.approx(535.4 / 4)
@@ -91,7 +94,7 @@ def test_camera_file(folder: Path) -> None:
     assert camera["depth_scale"] == 5000
 
 
-def test_masks_are_binary_and_info_tells_their_share(folder: Path) -> None:
+def test_masks_are_binary_and_info_has_their_share(folder: Path) -> None:
     info = json.loads((folder / "info.json").read_text())
     shares = []
     for path in sorted((folder / "masks").iterdir()):
@@ -105,27 +108,27 @@ def test_masks_are_binary_and_info_tells_their_share(folder: Path) -> None:
 
 def test_masks_are_the_rendered_people(folder: Path) -> None:
     scene = draw_scene(4, FRAMES, SIZE, "xyz", 3)
-    view = scene.view(7, scene.atlas())
+    view = scene.render_frame(7, scene.atlas())
     masks = sorted((folder / "masks").iterdir())
     np.testing.assert_array_equal(cv2.imread(str(masks[7]), 0) == 255, view.instance > 0)
 
 
-def test_written_truth_carries_depth_from_frame_to_frame(folder: Path) -> None:
-    """Static pixels of the first frame, moved by groundtruth.txt, meet the depth of the last one."""
+def test_groundtruth_maps_depth_between_frames(folder: Path) -> None:
+    """Static pixels of the first frame, moved by groundtruth.txt, meet the depth of the last."""
     camera = yaml.safe_load((folder / "camera.yaml").read_text())
     K = np.array([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     truth = np.array(rows(folder / "groundtruth.txt"), dtype=float)
-    stamps = [stamp for stamp, _ in rows(folder / "depth.txt")]
+    timestamps = [timestamp for timestamp, _ in rows(folder / "depth.txt")]
 
     def frame(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(truth[3 * k, 4:]).as_matrix()
         pose[:3, 3] = truth[3 * k, 1:4]
         depth = (
-            cv2.imread(str(folder / "depth" / f"{stamps[k]}.png"), cv2.IMREAD_UNCHANGED)
+            cv2.imread(str(folder / "depth" / f"{timestamps[k]}.png"), cv2.IMREAD_UNCHANGED)
             / camera["depth_scale"]
         )
-        return pose, depth, cv2.imread(str(folder / "masks" / f"{stamps[k]}.png"), 0) == 0
+        return pose, depth, cv2.imread(str(folder / "masks" / f"{timestamps[k]}.png"), 0) == 0
 
     (first_pose, first, first_static), (last_pose, last, last_static) = frame(0), frame(FRAMES - 1)
     v, u = np.nonzero(first_static & (first > 0))
@@ -146,7 +149,7 @@ def test_written_truth_carries_depth_from_frame_to_frame(folder: Path) -> None:
     assert (error < 3.5).mean() > 0.9
 
 
-def test_wall_depth_is_the_rooms_geometry() -> None:
+def test_wall_depth_follows_geometry_of_room() -> None:
     scene = draw_scene(4, 2, SIZE, "static", 0)
     pose = scene.poses[0]
     view = render(scene.room.mesh, scene.atlas(), scene.room.lighting, scene.camera, pose)
@@ -175,7 +178,9 @@ def test_wall_depth_is_the_rooms_geometry() -> None:
 def test_people_cover_a_fifth_to_two_fifths(seed: int) -> None:
     scene = draw_scene(seed, 240, SIZE, "xyz", 3)
     coarse, atlas = replace(scene, camera=scene.camera.resized(0.5)), scene.atlas()
-    shares = np.array([(coarse.view(k, atlas).instance > 0).mean() for k in range(0, 240, 12)])
+    shares = np.array(
+        [(coarse.render_frame(k, atlas).instance > 0).mean() for k in range(0, 240, 12)]
+    )
     assert 0.2 < shares.mean() < 0.4
     assert shares.max() < 0.68
 
@@ -204,7 +209,7 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
         ({"people": 13}, "people: 13"),
     ],
 )
-def test_bad_arguments_in_one_line(
+def test_invalid_arguments_are_refused_in_one_line(
     tmp_path: Path, arguments: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DataError, match=message) as caught:
@@ -213,11 +218,11 @@ def test_bad_arguments_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_importing_the_room_is_cheap() -> None:
-    code = "import sys, cohdc_train.synth; print([m for m in ('embreex', 'torch', 'scipy') if m in sys.modules])"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout
-        == "[]\n"
+def test_import_of_synth_is_cheap() -> None:
+    code = (
+        "import sys, cohdc_train.synth;"
+        "print([name for name in ('embreex', 'torch', 'scipy') if name in sys.modules])"
     )
+    command = [sys.executable, "-c", code]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert printed == "[]\n"

@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""Ablations of the network: HDC's rates on the same weights, and the CQE head's fusions, targets
-and uses.
+"""Ablations of the network: HDC's rates, and the CQE head's fusions, targets and uses.
 
     tools/experiments/ablations.py hdc --data ROOT [ROOT ...] --out DIR [--seeds 0 1 2] [--jobs 2]
         [-- OPTIONS OF cohdc fit]
@@ -15,7 +14,8 @@ import json
 import sys
 from pathlib import Path
 
-from training_runs import Run, run_all, spread, table
+from cohdc_train.bench.training import TrainingJob, format_mean, markdown_table, run_jobs
+from cohdc_train.errors import CohdcError
 
 RATES = {
     "(1, 1, 1)": "[1]",
@@ -70,7 +70,7 @@ def main() -> None:
     arguments = parser.parse_args(own.split())
     variants = HDC if arguments.study == "hdc" else CQE
     runs = {
-        (name, seed): Run(
+        (name, seed): TrainingJob(
             arguments.out
             / f"{arguments.study}_{name}_seed{seed}".replace(" ", "").replace(",", "-"),
             tuple(root.resolve() for root in arguments.data),
@@ -80,7 +80,10 @@ def main() -> None:
         for seed in arguments.seeds
         for name, options in variants.items()
     }
-    results = dict(zip(runs, run_all(list(runs.values()), arguments.jobs), strict=True))
+    try:
+        results = dict(zip(runs, run_jobs(list(runs.values()), arguments.jobs), strict=True))
+    except CohdcError as error:
+        raise SystemExit(str(error)) from None
     rows, kept = [], []
     for name in variants:
         for use in results[name, arguments.seeds[0]]:
@@ -89,8 +92,10 @@ def main() -> None:
                 {"variant": name, "use": use, "seed": s, **r}
                 for s, r in zip(arguments.seeds, scores, strict=True)
             ]
-            rows.append([name, use, *(spread([one[score] for one in scores]) for score in SCORES)])
-    text = table(["variant", "masks ranked", *SCORES], rows)
+            rows.append(
+                [name, use, *(format_mean([one[score] for one in scores]) for score in SCORES)]
+            )
+    text = markdown_table(["variant", "masks ranked", *SCORES], rows)
     (arguments.out / f"{arguments.study}.md").write_text(text)
     (arguments.out / f"{arguments.study}.json").write_text(json.dumps(kept, indent=2) + "\n")
     print(text)

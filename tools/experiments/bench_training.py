@@ -1,18 +1,16 @@
 #!/usr/bin/env python3
-"""Training and validation of this project against plain torchvision and pycocotools loops, paired
-on one machine.
+"""Speed of training and validation against plain torchvision and pycocotools loops.
 
-    tools/experiments/bench_training.py --data ROOT [--classes person] [--canvas 320 416] [--threads
-    1]
-        [--blocks 8] [--out FILE.json]
+    tools/experiments/bench_training.py --data ROOT [--classes person] [--canvas 320 416]
+        [--threads 1] [--blocks 8] [--out FILE.json]
 
 Both sides train the same ResNet-18 Mask R-CNN from the same weights on the same images in the same
-order; ours has its CQE head besides. The reference does what torchvision's detection training does:
+order; ours has a CQE head, too. The reference does what torchvision's detection training does:
 CocoDetection, polygons to masks, horizontal flip, resizing inside the model, SGD, float32; and
 validates by pasting masks, pycocotools' encoding and COCOeval of boxes and masks. Each side has a
 process of its own; blocks alternate, so that whatever else runs on the machine hits both.
-Validation needs a checkpoint, or finds next to nothing to paste: --checkpoint best.ckpt; the phase
-`file` validates its exported file instead: --onnx model.onnx.
+Validation needs a checkpoint, or detects next to nothing to paste: --checkpoint best.ckpt; the
+phase `file` validates its exported file instead: --onnx model.onnx.
 """
 
 import argparse
@@ -29,17 +27,17 @@ SIDES = ("ours", "reference")
 
 
 class Gate:
-    """The worker's end of the pipe: `next` says how long the block took and waits for the word to
-    go on.
-    """
+    """The worker's end of the pipe: `next` reports a block's time and waits for the next one."""
 
     def __init__(self, pipe: Connection) -> None:
+        """Wait at the worker's end of a pipe."""
         self.pipe = pipe
-        self.resident = 0  # MiB before the first block: the packages, which are the same on both sides, and the network
+        # MiB before the first block: the packages, which both sides share, and the network.
+        self.resident = 0
         self.started = time.perf_counter()
 
     def next(self) -> bool:
-        """False when no further block is wanted."""
+        """Report a block; returns False when no further one is wanted."""
         self.resident = self.resident or mebibytes("VmRSS")
         self.pipe.send(time.perf_counter() - self.started)
         go: bool = self.pipe.recv()
@@ -48,6 +46,7 @@ class Gate:
 
 
 def options() -> argparse.Namespace:
+    """Read the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -97,7 +96,7 @@ def options() -> argparse.Namespace:
 
 
 def network_config(args: argparse.Namespace) -> Any:
-    """The network of both sides: that of the checkpoint, or a slim ResNet-18 with HDC."""
+    """Return the network of both sides: the checkpoint's, or a slim ResNet-18 with HDC."""
     import yaml
 
     from cohdc_train.models import NetworkConfig
@@ -131,7 +130,7 @@ def network_config(args: argparse.Namespace) -> Any:
     )
 
 
-def pictures(args: argparse.Namespace) -> Any:
+def open_data(args: argparse.Namespace) -> Any:
     """Our data."""
     from cohdc_train.data.datamodule import CocoDataModule
     from cohdc_train.data.transforms import Augmentation
@@ -142,12 +141,12 @@ def pictures(args: argparse.Namespace) -> Any:
 
 
 def built(args: argparse.Namespace, checkpoint: Path | None = None) -> tuple[Any, Any]:
-    """Our module and its data; the same weights on both sides, by the seed or from the checkpoint."""
+    """Build our module and its data; both sides have the same weights."""
     import torch
 
     from cohdc_train.train.module import MaskRCNNModule, OptimizerConfig
 
-    data = pictures(args)
+    data = open_data(args)
     torch.manual_seed(args.seed)
     sgd = OptimizerConfig("sgd", 1e-3, 1e-4)
     if checkpoint is not None:
@@ -156,9 +155,7 @@ def built(args: argparse.Namespace, checkpoint: Path | None = None) -> tuple[Any
 
 
 def order(args: argparse.Namespace, data: Any) -> list[int]:
-    """Positions of the training images that have objects, in the order in which both sides see
-    them.
-    """
+    """List the training images that have objects, in the order in which both sides see them."""
     import numpy as np
 
     images = data.folder.train[0].images
@@ -172,7 +169,7 @@ def order(args: argparse.Namespace, data: Any) -> list[int]:
 
 
 def train_ours(args: argparse.Namespace, gate: Gate) -> None:
-    """`cohdc fit`'s module, data and trainer; a callback stops between blocks."""
+    """Train with `cohdc fit`'s module, data and trainer; a callback stops between blocks."""
     import lightning.pytorch as pl
     from torch.utils.data import DataLoader, Subset
 
@@ -183,12 +180,16 @@ def train_ours(args: argparse.Namespace, gate: Gate) -> None:
     data.train_dataloader = lambda: loader
 
     class Blocks(pl.Callback):
+        """Callback that stops between blocks of steps."""
+
         def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+            """Wait for the first block."""
             gate.next()
 
         def on_train_batch_end(
             self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
         ) -> None:
+            """Wait after the last step of a block."""
             if (batch_idx + 1) % args.steps == 0:
                 gate.next()
 
@@ -207,6 +208,7 @@ def train_ours(args: argparse.Namespace, gate: Gate) -> None:
 
 
 def train_reference(args: argparse.Namespace, gate: Gate) -> None:
+    """Train with torchvision's loop."""
     import reference_loops
 
     module, data = built(args)
@@ -214,6 +216,7 @@ def train_reference(args: argparse.Namespace, gate: Gate) -> None:
 
 
 def validate_reference(args: argparse.Namespace, gate: Gate) -> None:
+    """Validate with torchvision's loop and pycocotools."""
     import reference_loops
 
     module, data = built(args, args.checkpoint)
@@ -221,7 +224,7 @@ def validate_reference(args: argparse.Namespace, gate: Gate) -> None:
 
 
 def validate_ours(args: argparse.Namespace, gate: Gate) -> None:
-    """`cohdc validate`'s way: the trainer, the padded forward, every score."""
+    """Validate as `cohdc validate`: the trainer, the padded forward, all scores."""
     import lightning.pytorch as pl
     from torch.utils.data import DataLoader, Subset
 
@@ -248,13 +251,13 @@ def validate_ours(args: argparse.Namespace, gate: Gate) -> None:
 
 
 def validate_file(args: argparse.Namespace, gate: Gate) -> None:
-    """`cohdc validate FILE.onnx`'s way: onnxruntime, image by image, every score."""
+    """Validate as `cohdc validate FILE.onnx`: onnxruntime, image by image, all scores."""
     from dataclasses import replace
 
     from cohdc_train.segmenter import Segmenter
     from cohdc_train.validation import score_segmenter
 
-    split = pictures(args).folder.val
+    split = open_data(args).folder.val
     split = replace(split, images=split.images[: args.val_images])
     segmenter = Segmenter(args.onnx, args.threads)
     while gate.next():
@@ -263,15 +266,16 @@ def validate_file(args: argparse.Namespace, gate: Gate) -> None:
 
 
 def mebibytes(line: str) -> int:
-    """Resident memory of this process: VmRSS now, VmHWM its peak (ru_maxrss would count the
-    parent's too).
+    """Read this process's resident memory: VmRSS now, VmHWM its peak.
+
+    ru_maxrss would count the parent's too.
     """
     status = Path("/proc/self/status").read_text(encoding="utf-8")
     return int(status.partition(f"{line}:")[2].split()[0]) // 1024
 
 
 def work(side: str, phase: str, args: argparse.Namespace, pipe: Connection) -> None:
-    """A worker process: one side of one phase."""
+    """Run one side of one phase in a worker process."""
     if side == "ours":  # as `cohdc fit` and `cohdc validate` do
         from cohdc_train.train.malloc import keep_freed_memory
 
@@ -297,7 +301,7 @@ def work(side: str, phase: str, args: argparse.Namespace, pipe: Connection) -> N
 
 
 def measure(phase: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Seconds of every block and peak memory of both sides."""
+    """Measure the seconds of all blocks and the peak memory of both sides."""
     context = get_context("spawn")
     pipes: dict[str, Connection] = {}
     for side in SIDES:
@@ -323,6 +327,7 @@ def measure(phase: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def report(phase: str, found: dict[str, Any]) -> str:
+    """Format the medians of both sides."""
     rates = ", ".join(
         f"{side} {statistics.median(found['images_per_s'][side]):.2f} images/s" for side in SIDES
     )
@@ -338,6 +343,7 @@ def report(phase: str, found: dict[str, Any]) -> str:
 
 
 def main() -> int:
+    """Run both sides of all phases, and print."""
     args = options()
     os.environ |= {"OMP_NUM_THREADS": str(args.threads)}  # before torch is loaded in the workers
     found = {}

@@ -18,31 +18,36 @@ import numpy as np
 
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
-from cohdc_train.slam.config import Culling
-from cohdc_train.slam.dynamics.mask_propagation import Half, Propagation, halve, halve_mask
+from cohdc_train.slam.config import MaskConfig
+from cohdc_train.slam.dynamics.mask_propagation import (
+    HalfResFrame,
+    MaskPropagator,
+    downsample,
+    downsample_mask,
+)
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder
-from cohdc_train.slam.dynamics.masks import Mask
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.io.sources import Recorded
+from cohdc_train.slam.io.sources import RecordedSequence
+from cohdc_train.types import Mask
 
 
-def halves(folder: Path) -> list[tuple[Half, Mask]]:
+def halves(folder: Path) -> list[tuple[HalfResFrame, Mask]]:
     """All frames of a sequence at half size, and their true masks. Raises DataError for what cannot
     be used.
     """
     camera = choose_camera(folder, None)[0]
-    masks = MaskFolder(folder / "masks", camera, Culling())
+    masks = MaskFolder(folder / "masks", camera, MaskConfig())
     return [
-        (halve(view.rgb, view.depth), halve_mask(masks.outline(view)[0]))
-        for view in Recorded(folder, camera)
+        (downsample(view.rgb, view.depth), downsample_mask(masks.segment(view)[0]))
+        for view in RecordedSequence(folder, camera)
     ]
 
 
-def carried_on(frames: list[tuple[Half, Mask]]) -> list[Mask]:
+def carried_on(frames: list[tuple[HalfResFrame, Mask]]) -> list[Mask]:
     """The first frame's mask in each of the others."""
-    propagation = Propagation()
+    propagation = MaskPropagator()
     first, mask = frames[0]
-    propagation.renew(mask, propagation.advance(first), first)
+    propagation.update(mask, propagation.advance(first), first)
     masks = []
     for frame, _ in frames[1:]:
         propagation.advance(frame)
@@ -52,7 +57,7 @@ def carried_on(frames: list[tuple[Half, Mask]]) -> list[Mask]:
     return masks
 
 
-def likeness(mask: Mask, truth: Mask) -> tuple[float, float, float]:
+def overlap(mask: Mask, truth: Mask) -> tuple[float, float, float]:
     """IoU, share of the truth that is covered, share of the rest that is."""
     both, either, people = (np.count_nonzero(part) for part in (mask & truth, mask | truth, truth))
     return (
@@ -73,7 +78,7 @@ def measured(folder: Path, steps: list[int], every: int) -> list[dict[str, Any]]
     found = []
     for start in starts:
         masks = carried_on(frames[start : start + last + 1])
-        found.append([likeness(masks[step - 1], frames[start + step][1]) for step in steps])
+        found.append([overlap(masks[step - 1], frames[start + step][1]) for step in steps])
     means, names = np.mean(found, axis=0), ("iou", "covered", "others")
     return [
         {"sequence": folder.name, "frames": step, **dict(zip(names, row.tolist(), strict=True))}

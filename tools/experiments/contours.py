@@ -5,8 +5,8 @@
         [--model FILE --photos FOLDER] [--count 300] [--seed 0]
 
 Sources: people that `cohdc synth` renders, the annotated objects of every COCO folder, and the
-masks that a model finds in a folder's images. `count` of each are drawn by the seed among those of
-at least 400 px. `dp` has one tolerance per source and floor, at which its mean IoU is that of
+masks that a model detects in a folder's images. `count` of each are drawn by the seed among those
+of at least 400 px. `dp` has one tolerance per source and floor, at which its mean IoU is that of
 bas_dp. Writes contours.json, contours.md and contours.png to DIR.
 """
 
@@ -22,11 +22,11 @@ import cv2
 import numpy as np
 import torch
 
-from cohdc_train.contour import Polygon, rasterize, simplify, trace, vertices
+from cohdc_train.contour import Polygon, count_vertices, rasterize, simplify, trace
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes, write_json, write_text
-from cohdc_train.models.cqe_targets import band_of, boundary_iou
-from cohdc_train.prediction.image_sources import read_pictures
+from cohdc_train.models.cqe_targets import boundary_band_px, boundary_iou
+from cohdc_train.prediction.image_sources import read_images
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.synth.coco import coco
 
@@ -57,10 +57,8 @@ def main() -> None:
         if not masks:
             continue
         outlines = [trace(mask) for mask in masks]
-        print(
-            f"{source}: {len(masks)} contours, {np.mean([vertices(o) for o in outlines]):.0f} vertices",
-            flush=True,
-        )
+        vertices = np.mean([count_vertices(outline) for outline in outlines])
+        print(f"{source}: {len(masks)} contours, {vertices:.0f} vertices", flush=True)
         rows.append(measured("trace", source, 1.0, masks, outlines, [0.0]))
         for floor in FLOORS:
             for method in METHODS:
@@ -74,7 +72,7 @@ def main() -> None:
 
 
 def sources(arguments: argparse.Namespace) -> Iterator[tuple[str, list[np.ndarray]]]:
-    """(name, masks) of each source; crowds are left out."""
+    """List (name, masks) of each source; crowds are skipped."""
     rng = np.random.default_rng(arguments.seed)
     with tempfile.TemporaryDirectory() as folder:
         coco(
@@ -89,10 +87,10 @@ def sources(arguments: argparse.Namespace) -> Iterator[tuple[str, list[np.ndarra
         name, _, root = entry.partition("=")
         yield name, annotated(Path(root), arguments.count, rng)
     if arguments.model is not None:
-        network = Segmenter(arguments.model, threads=1)
+        network = Segmenter(arguments.model, num_threads=1)
         masks: list[np.ndarray] = []
-        for picture in read_pictures(arguments.photos):
-            found = network(picture.rgb)
+        for image in read_images(arguments.photos):
+            found = network(image.rgb)
             masks += [
                 mask
                 for mask in found.select(found.scores >= 0.5).masks()
@@ -104,7 +102,7 @@ def sources(arguments: argparse.Namespace) -> Iterator[tuple[str, list[np.ndarra
 
 
 def annotated(root: Path, count: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Masks of training objects, drawn."""
+    """Draw the masks of some training objects."""
     images = CocoDataModule(root).folder.train[0].images
     objects = [(image, o) for image in images for o in image.objects if not o.crowd]
     masks = []
@@ -121,7 +119,7 @@ def annotated(root: Path, count: int, rng: np.random.Generator) -> list[np.ndarr
 def simplified(
     outlines: list[list[Polygon]], floor: float, method: str, epsilon: float = 2.0
 ) -> tuple[list[list[Polygon]], list[float]]:
-    """Outlines and the CPU seconds of each."""
+    """Simplify outlines; returns them and the CPU seconds of each."""
     simpler, taken = [], []
     for outline in outlines:
         started = time.process_time()
@@ -131,7 +129,7 @@ def simplified(
 
 
 def ious(masks: list[np.ndarray], outlines: list[list[Polygon]]) -> list[float]:
-    """IoU of each outline with its mask."""
+    """Compute the IoU of each outline with its mask."""
     values = []
     for mask, outline in zip(masks, outlines, strict=True):
         filled = rasterize(outline, mask.shape)
@@ -147,14 +145,16 @@ def measured(
     outlines: list[list[Polygon]],
     taken: list[float],
 ) -> dict[str, object]:
-    """A row of contours.json: means over the contours, and the median time."""
+    """Make a row of contours.json: means over the contours, and the median time."""
     overlap = ious(masks, outlines)
     edges = []
     for mask, outline in zip(masks, outlines, strict=True):
         filled = rasterize(outline, mask.shape)
         edges.append(
             float(
-                boundary_iou(torch.from_numpy(filled), torch.from_numpy(mask), band_of(*mask.shape))
+                boundary_iou(
+                    torch.from_numpy(filled), torch.from_numpy(mask), boundary_band_px(*mask.shape)
+                )
             )
         )
     texts = [
@@ -166,7 +166,7 @@ def measured(
         "source": source,
         "iou_floor": floor,
         "contours": len(masks),
-        "vertices": statistics.fmean(vertices(outline) for outline in outlines),
+        "vertices": statistics.fmean(count_vertices(outline) for outline in outlines),
         "iou_mean": statistics.fmean(overlap),
         "iou_min": min(overlap),
         "boundary_iou": statistics.fmean(edges),
@@ -179,7 +179,7 @@ def measured(
 def fixed_tolerance(
     source: str, floor: float, masks: list[np.ndarray], outlines: list[list[Polygon]], mean: float
 ) -> dict[str, object]:
-    """Douglas-Peucker with the one tolerance whose mean IoU is `mean`."""
+    """Simplify by Douglas-Peucker with the one tolerance whose mean IoU is `mean`."""
     low, high = 0.1, 20.0
     for _ in range(9):
         middle = (low * high) ** 0.5
@@ -192,9 +192,9 @@ def fixed_tolerance(
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown; the shares are of bisection's vertices and of fixed Douglas-Peucker's."""
-    text = "| source | floor | method | vertices | of bisection | of dp | IoU mean | IoU least | Boundary IoU | "
-    text += "ms median | ms p95 | bytes |\n" + "|---" * 12 + "|\n"
+    """Format a Markdown table, relative to bisection and to fixed Douglas-Peucker."""
+    text = "| source | floor | method | vertices | of bisection | of dp | IoU mean | IoU least "
+    text += "| Boundary IoU | ms median | ms p95 | bytes |\n" + "|---" * 12 + "|\n"
     for row in rows:
         rest = {
             r["method"]: r
@@ -219,7 +219,7 @@ def table(rows: list[dict]) -> str:
 
 
 def plot(rows: list[dict]) -> bytes:
-    """Vertices over mean IoU as a PNG, a panel per source."""
+    """Plot vertices over mean IoU as a PNG, one panel per source."""
     import io
 
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -3,7 +3,7 @@
 filter at 0.9.
 
     tools/experiments/culling_ablation.py --sequences DIR [DIR ...] --out OUT [--model person]
-        [--seeds 0 1 2] [--method KEY=VALUE ...]
+        [--seeds 0 1 2] [--settings OPTION=VALUE ...]
 
 The model segments every frame once; the masks that each way of culling makes of that are written as
 PNGs, and `cohdc slam` runs on them. The bands that are alike are as wide as those by quality are on
@@ -21,20 +21,20 @@ from typing import Any
 
 import cv2
 import numpy as np
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
 from cohdc_train.files import write_json, write_text
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Detections, Segmenter
-from cohdc_train.slam.config import Culling
-from cohdc_train.slam.dynamics.mask_sources import dynamic_mask, dynamic_objects, growth
+from cohdc_train.slam.config import MaskConfig, SlamConfig
+from cohdc_train.slam.dynamics.mask_sources import dilation_for, dynamic_mask, select_dynamic
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.io.sources import Recorded, rgbd_layout
+from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
 from cohdc_train.slam.io.tum import read_mask
-from cohdc_train.slam.run import slam
+from cohdc_train.slam.run import run_slam
 
 Row = dict[str, Any]
-BY_QUALITY = Culling(doubt=1.0)
+BY_QUALITY = MaskConfig(quality_dilation=1.0)
 
 
 def main() -> None:
@@ -45,20 +45,21 @@ def main() -> None:
     rows: list[Row] = []
     for sequence in arguments.sequences:
         camera, _ = choose_camera(sequence, None)
-        source = Recorded(sequence, camera, rgbd_layout(camera))
+        source = RecordedSequence(sequence, camera, rgbd_format(camera))
         found = {view.name: segmenter(view.rgb) for view in source}
         truth = {name: read_mask(sequence / "masks" / f"{name}.png", camera) for name in found}
-        for way, culling in ways(found.values(), labels).items():
+        for way, config in ways(found.values(), labels).items():
             folder = arguments.out / sequence.name / way.replace(" ", "_")
             row = {"sequence": sequence.name, "way": way}
-            row |= write_masks(folder / "masks", found, truth, labels, culling)
+            row |= write_masks(folder / "masks", found, truth, labels, config)
             for seed in arguments.seeds:
-                given = {
-                    "masks": folder / "masks",
-                    "culling": Culling(dilate=0),
-                    "method": arguments.method,
-                }
-                metrics = slam(sequence=sequence, out=folder / f"seed{seed}", seed=seed, **given)
+                options = {"seed": seed, "masks.dilation_px": 0, **arguments.settings}
+                metrics = run_slam(
+                    sequence,
+                    folder / f"seed{seed}",
+                    masks=folder / "masks",
+                    settings=SlamConfig().override(options),
+                )
                 ate = metrics.get("ate_m", {}).get("rmse")
                 rows.append(row | {"seed": seed, "ate_m": ate, "coverage": metrics["coverage"]})
                 write_json(arguments.out / "culling.json", rows)
@@ -67,7 +68,7 @@ def main() -> None:
 
 
 def parse() -> argparse.Namespace:
-    """The arguments; `method` is a Method."""
+    """Return the arguments."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -79,22 +80,22 @@ def parse() -> argparse.Namespace:
         "--model", type=Path, default=Path("person"), help="ONNX or a shipped network's name"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    add_method_option(parser)
+    add_settings_option(parser)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     return arguments
 
 
-def ways(found: Iterable[Detections], labels: frozenset[int]) -> dict[str, Culling]:
+def ways(found: Iterable[Detections], labels: frozenset[int]) -> dict[str, MaskConfig]:
     """What is compared, on the detections of a sequence."""
-    qualities = [q for one in found for q in dynamic_objects(one, labels, BY_QUALITY).quality]
-    alike = round(growth(BY_QUALITY, float(np.mean(qualities or [1.0]))))
+    qualities = [q for one in found for q in select_dynamic(one, labels, BY_QUALITY).quality]
+    alike = round(dilation_for(BY_QUALITY, float(np.mean(qualities or [1.0]))))
     return {
         "by quality": BY_QUALITY,
-        "alike": replace(BY_QUALITY, doubt=0.0, dilate=alike),
-        "alike, 10 px": replace(BY_QUALITY, doubt=0.0),
-        "no band": replace(BY_QUALITY, dilate=0),
-        "filter .9": replace(BY_QUALITY, quality=0.9),
+        "alike": replace(BY_QUALITY, quality_dilation=0.0, dilation_px=alike),
+        "alike, 10 px": replace(BY_QUALITY, quality_dilation=0.0),
+        "no band": replace(BY_QUALITY, dilation_px=0),
+        "filter .9": replace(BY_QUALITY, min_quality=0.9),
     }
 
 
@@ -103,20 +104,20 @@ def write_masks(
     found: dict[str, Detections],
     truth: dict[str, np.ndarray],
     labels: frozenset[int],
-    culling: Culling,
+    config: MaskConfig,
 ) -> Row:
     """PNGs of what is culled, and how well that covers the true masks."""
     folder.mkdir(parents=True, exist_ok=True)
     covered, lost, people, others = 0, 0, 0, 0
     for name, detections in found.items():
-        mask = dynamic_mask(detections, labels, culling)
+        mask = dynamic_mask(detections, labels, config)
         cv2.imwrite(str(folder / f"{name}.png"), mask.astype(np.uint8) * 255)
         covered, people = covered + int((mask & truth[name]).sum()), people + int(truth[name].sum())
         lost, others = lost + int((mask & ~truth[name]).sum()), others + int((~truth[name]).sum())
     return {
         "covered": covered / max(people, 1),
         "lost": lost / max(others, 1),
-        "dilate": culling.dilate,
+        "dilate": config.dilation_px,
     }
 
 

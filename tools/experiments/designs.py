@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
-"""Size and speed of network designs before any is trained: random weights, one class, from image to
-masks.
+"""Size and speed of network designs before training: random weights, image to masks.
 
-    tools/experiments/designs.py --out DIR [--designs R50 n ...] [--canvas 480 640] [--threads 1]
-    [--pictures 6]
+    tools/experiments/designs.py --out DIR [--designs R50 n ...] [--canvas 480 640]
+        [--threads 1] [--images 6]
 
-Every design is written as ONNX, in float32 and int8, and all files take turns on the same pictures.
-A random network finds as many objects as its padding holds, so that the time is that of a full
-picture. Times are shares of the first design's in float32. Writes designs.md and designs.json to
+Every design is written as ONNX, in float32 and int8, and all files take turns on the same images.
+A random network detects as many objects as its padding holds, so that the time is that of a full
+image. Times are shares of the first design's in float32. Writes designs.md and designs.json to
 DIR.
 """
 
@@ -18,10 +17,10 @@ from typing import Any
 import torch
 import yaml
 
-from cohdc_train.bench.speed import frame_rates, runners_of
+from cohdc_train.bench.speed import frame_rates, make_runners
 from cohdc_train.exporter.graph import count_flops, write_graph
 from cohdc_train.exporter.quantization import quantize
-from cohdc_train.exporter.sample_images import drawn_images
+from cohdc_train.exporter.sample_images import draw_samples
 from cohdc_train.files import write_json, write_text
 from cohdc_train.models import MaskRCNN, NetworkConfig
 from cohdc_train.presets import config_path
@@ -33,7 +32,7 @@ COARSE = {"finest_stride": 8, "anchor_scales": (32, 64, 128, 256)}
 
 
 def shape_of(size: str) -> dict[str, Any]:
-    """The network of the family's shipped configuration."""
+    """Read the network of the family's shipped configuration."""
     whole = yaml.safe_load(config_path(f"networks/hdc_net_{size}.yaml").read_text(encoding="utf-8"))
     return dict(whole["model"]["network"])
 
@@ -81,7 +80,7 @@ DESIGNS = {
 
 
 def main() -> None:
-    """Write, quantise, time, print."""
+    """Write, quantize, time, print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -89,12 +88,12 @@ def main() -> None:
     parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=list(DESIGNS))
     parser.add_argument("--canvas", type=int, nargs=2, default=(480, 640))
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument("--images", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(arguments.threads)
-    pictures, runners, costs = drawn_images(arguments.pictures), {}, {}
+    images, runners, costs = draw_samples(arguments.images), {}, {}
     for name in arguments.designs:
         torch.manual_seed(arguments.seed)
         config = NetworkConfig(**{"canvas": tuple(arguments.canvas), **DESIGNS[name]})
@@ -102,14 +101,14 @@ def main() -> None:
         file = arguments.out / f"{name.replace(' ', '_')}.onnx"
         small = file.with_suffix(".int8.onnx")
         write_graph(network, ["person"], file)
-        quantize(file, small, pictures[:2])
+        quantize(file, small, images[:2])
         costs[name] = count_flops(network)
         files = {"float32": file, "int8": small}
         runners |= {
-            (name, kind): run for kind, run in runners_of(None, files, arguments.threads).items()
+            (name, kind): run for kind, run in make_runners(None, files, arguments.threads).items()
         }
         print(f"{name}: {file.stat().st_size / 1e6:.1f} MB", flush=True)
-    rates = frame_rates(runners, pictures)
+    rates = frame_rates(runners, images)
     base = rates[arguments.designs[0], "float32"].median
     rows = []
     for name in arguments.designs:
@@ -130,8 +129,8 @@ def main() -> None:
         "| design | MB | MB int8 | GFLOPs | time float32 | time int8 |\n|---|---|---|---|---|---|\n"
     )
     lines = [
-        f"| {r['design']} | {r['mb']:.1f} | {r['mb_int8']:.1f} | {r['gflops_image']:.1f} | {r['float32']:.3f} "
-        f"| {r['int8']:.3f} |"
+        f"| {r['design']} | {r['mb']:.1f} | {r['mb_int8']:.1f} | {r['gflops_image']:.1f} "
+        f"| {r['float32']:.3f} | {r['int8']:.3f} |"
         for r in rows
     ]
     write_text(arguments.out / "designs.md", head + "\n".join(lines) + "\n")

@@ -48,6 +48,36 @@ def first_of(*places: str) -> Any:
     raise ImportError(f"none of {', '.join(places)}")
 
 
+def run_system(sequence: Path) -> FlowRun:
+    """Drive `Slam(camera, config, executor=..., frame_time_used=...)`."""
+    slam = "cohdc_train.slam"
+    executor = first_of(f"{slam}.runtime.executors:SynchronousExecutor")
+    system_class = first_of(f"{slam}.system:Slam")
+    config = first_of(f"{slam}.config:SlamConfig")()
+    single_threaded = first_of(
+        f"{slam}.runtime.threads:single_threaded", f"{slam}.runtime.threads:one_thread"
+    )
+    frames = open_frames(sequence)
+    used = 0.0
+    poses, rows = [], []
+    with single_threaded():
+        system = system_class(
+            frames.camera,
+            config.override({"features.max_keypoints": _MAX_KEYPOINTS}),
+            executor=executor(),
+            frame_time_used=lambda: used,
+        )
+        for index, frame in enumerate(frames):
+            used = _TIME_USED[index % len(_TIME_USED)]
+            result = system.track(frame)
+            poses.append(np.full((4, 4), np.nan) if result.T_wc is None else result.T_wc)
+            rows.append((int(result.is_keyframe), result.num_matches))
+        trajectory = system.finish()
+    timestamps = getattr(trajectory, "timestamps", None)
+    timestamps = trajectory.timestamps if timestamps is None else timestamps
+    return FlowRun(poses, rows, timestamps, trajectory.poses)
+
+
 def run_tracker(sequence: Path) -> FlowRun:
     """Drive `Tracker(camera, features, seed, method, executor, spent)`."""
     slam = "cohdc_train.slam"
@@ -93,7 +123,8 @@ def open_frames(sequence: Path) -> Any:
     return recorded(sequence, choose_camera(sequence, None)[0])
 
 
-LAYOUTS: tuple[Callable[[Path], FlowRun], ...] = (run_tracker,)  # the newest first
+# The newest first.
+LAYOUTS: tuple[Callable[[Path], FlowRun], ...] = (run_system, run_tracker)
 
 
 def run_layout(sequence: Path) -> FlowRun:

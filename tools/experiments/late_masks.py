@@ -7,7 +7,7 @@ between matched frames.
 
 Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done at once, no frame
 is dropped, and the segmenter always takes --late frames: the same numbers on every machine.
-`--method flow=false` matches every frame, as synchronous runs do. A few corners more or fewer show
+`--settings flow.enabled=false` matches every frame, as synchronous runs do. A few corners more or fewer show
 what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the means. Without
 --model masks are those in the sequence's folder `masks`.
 """
@@ -17,40 +17,45 @@ import statistics
 from collections.abc import Callable
 from pathlib import Path
 
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
 from cohdc_train.errors import CohdcError, DataError
 from cohdc_train.files import write_json, write_text
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.slam.config import Culling, Method
-from cohdc_train.slam.dynamics.mask_propagation import CarriedMasks, Job, halve_mask
+from cohdc_train.slam.config import MaskConfig, SlamConfig
+from cohdc_train.slam.dynamics.mask_propagation import (
+    PropagatedMask,
+    SegmentationJob,
+    downsample_mask,
+)
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks
-from cohdc_train.slam.dynamics.masks import Mask, grow
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.dynamics.masks import dilate_mask
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.calibration import choose_camera
-from cohdc_train.slam.io.sources import Recorded, rgbd_layout
-from cohdc_train.slam.runtime.async_masks import Outline
+from cohdc_train.slam.io.sources import RecordedSequence, rgbd_format
+from cohdc_train.slam.runtime.async_masks import SegmentFunction
 from cohdc_train.slam.runtime.executors import SynchronousExecutor
-from cohdc_train.slam.runtime.threads import one_thread
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.runtime.threads import single_threaded
+from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum
+from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import Mask
 
 
 class LateMasks:
-    """Masks as `AsyncMasks` makes them, of a segmenter that takes `late` frames; the first is
+    """Masks as `AsyncSegmenter` makes them, of a segmenter that takes `late` frames; the first is
     waited for.
     """
 
-    def __init__(self, outline: Outline, late: int) -> None:
-        self._outline, self._late = outline, late
-        self._carried = CarriedMasks()
-        self._at_work: Job | None = None
+    def __init__(self, segment: SegmentFunction, late: int) -> None:
+        self._segment, self._late = segment, late
+        self._carried = PropagatedMask()
+        self._at_work: SegmentationJob | None = None
 
-    def __call__(self, view: View) -> Mask:
+    def __call__(self, view: RGBDFrame) -> Mask:
         """[H, W] bool, True = dynamic."""
         if self._late == 0:
-            return grow(*self._outline(view))
+            return dilate_mask(*self._segment(view))
         job = self._carried.advance(view)
         if self._at_work is not None and job.number >= self._at_work.number + self._late:
             self._done(self._at_work)
@@ -60,47 +65,53 @@ class LateMasks:
             self._at_work = job
         return self._carried.mask(view)
 
-    def _done(self, job: Job) -> None:
-        mask, growth = self._outline(job.view)
-        self._carried.renew(job, halve_mask(mask), growth)
+    def _done(self, job: SegmentationJob) -> None:
+        mask, growth = self._segment(job.frame)
+        self._carried.update(job, downsample_mask(mask), growth)
         self._at_work = None
 
 
-def remembered(outline: Outline) -> Outline:
+def remembered(segment: SegmentFunction) -> SegmentFunction:
     """The same, asked once for every frame."""
     known: dict[str, tuple[Mask, float]] = {}
 
-    def ask(view: View) -> tuple[Mask, float]:
+    def ask(view: RGBDFrame) -> tuple[Mask, float]:
         if view.name not in known:
-            known[view.name] = outline(view)
+            known[view.name] = segment(view)
         return known[view.name]
 
     return ask
 
 
-def opened(folder: Path, model: Path | None) -> tuple[Recorded, Outline]:
+def opened(folder: Path, model: Path | None) -> tuple[RecordedSequence, SegmentFunction]:
     """A sequence, and what outlines its people. Raises DataError for what cannot be used."""
     camera = choose_camera(folder, None)[0]
-    source = Recorded(folder, camera, rgbd_layout(camera))
+    source = RecordedSequence(folder, camera, rgbd_format(camera))
     if source.groundtruth is None:
         raise DataError(f"{folder}: no groundtruth.txt to score by")
     if model is None:
-        return source, remembered(MaskFolder(folder / "masks", camera, Culling()).outline)
-    return source, remembered(SegmenterMasks(Segmenter(model), Culling()).outline)
+        return source, remembered(MaskFolder(folder / "masks", camera, MaskConfig()).segment)
+    return source, remembered(SegmenterMasks(Segmenter(model), MaskConfig()).segment)
 
 
-def error(source: Recorded, masks: Callable[[View], Mask], features: int, method: Method) -> float:
-    """ATE RMSE, m."""
-    with one_thread():
-        tracker = Tracker(source.camera, features, 0, method, SynchronousExecutor())
-        for view in source:
-            tracker.track(view.rgb, view.depth, view.t, masks(view), view.depth_t)
-        tracker.finish()
+def error(
+    source: RecordedSequence, masks: Callable[[RGBDFrame], Mask], settings: SlamConfig
+) -> float:
+    """Return the ATE RMSE, m."""
+    with single_threaded():
+        slam = Slam(source.camera, settings, executor=SynchronousExecutor())
+        for frame in source:
+            slam.track(frame, masks(frame))
+        trajectory = slam.finish()
     assert source.groundtruth is not None
-    rmse: float = score(read_tum(source.groundtruth), Trajectory(*tracker.trajectory()))["ate_m"][
-        "rmse"
-    ]
+    rmse: float = score(Trajectory.load_tum(source.groundtruth), trajectory)["ate_m"]["rmse"]
     return rmse
+
+
+def settings_of(arguments: argparse.Namespace, max_keypoints: int) -> SlamConfig:
+    """Return the settings of a run."""
+    options = {"features.max_keypoints": max_keypoints, **arguments.settings}
+    return SlamConfig().override(options)
 
 
 def main() -> None:
@@ -115,7 +126,7 @@ def main() -> None:
     parser.add_argument(
         "--features", type=int, nargs="+", default=[1475, 1500, 1525], help="corners a frame"
     )
-    add_method_option(parser)
+    add_settings_option(parser)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     try:
@@ -131,10 +142,10 @@ def run(arguments: argparse.Namespace) -> None:
         ["| sequence | late by frames | mean ATE RMSE, m | each |", "|---|---|---|---|"],
     )
     for folder in arguments.sequences:
-        source, outline = opened(folder, arguments.model)
+        source, segment = opened(folder, arguments.model)
         for late in arguments.late:
             errors = [
-                error(source, LateMasks(outline, late), n, arguments.method)
+                error(source, LateMasks(segment, late), settings_of(arguments, n))
                 for n in arguments.features
             ]
             rows += [

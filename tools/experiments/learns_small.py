@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""What `cohdc fit` learns on small real sets in minutes, against torchvision's recipe on the same
-network.
+"""Scores of `cohdc fit` on small real sets in minutes, against torchvision's recipe.
 
     tools/experiments/learns_small.py --data SET [SET ...] --imagenet mobilenet_v2.pth --out DIR
         [--minutes 6 60] [--seeds 0 1 2] [--precision 32-true]
@@ -8,15 +7,15 @@ network.
 Two contenders train at a time, each in a process of its own with one thread, on a core of its own,
 by the clock:
 
-    shipped         cohdc fit SET --minutes M                       (README's command: starts from
-    the shipped weights) imagenet        the same with --pretrained mobilenet_v2.pth
-    torchvision-LR  torchvision's references/detection recipe, written in reference_loops.py: SGD
-    .9, weight decay
-                    1e-4, frozen norms and first two parts, horizontal flip, warm-up of its first
-                    epoch (at most 1000 steps), rate divided by ten at 16/26 and 22/26 of the
-                    budget; the same ImageNet weights and canvas
-    torchvision-LR-short   the same with a warm-up of 5 % of the budget: its own takes a third of
-    six minutes
+    shipped               cohdc fit SET --minutes M (README's command: starts from the shipped
+                          weights)
+    imagenet              cohdc fit SET --minutes M --pretrained mobilenet_v2.pth
+    torchvision-LR        torchvision's references/detection recipe (reference_loops.py): SGD .9,
+                          weight decay 1e-4, frozen norms and first two parts, horizontal flip,
+                          warm-up of its first epoch (at most 1000 steps), rate divided by ten at
+                          16/26 and 22/26 of the budget, the same ImageNet weights and canvas
+    torchvision-LR-short  the same recipe with a warm-up of 5 % of the budget: its own takes a third
+                          of six minutes
 
 All have the same network (networks/hdc_net_n.yaml), canvas and batch size. The clock of `cohdc fit`
 includes its validations; torchvision's clock stops while it is scored. The last weights of each are
@@ -220,8 +219,9 @@ def fit_command(
 def train_ours(
     data: Path, pretrained: str, minutes: float, seed: int, folder: Path, precision: str
 ) -> tuple[list[tuple[float, float]], int, dict[str, float]]:
-    """Run `cohdc fit` and score its last.ckpt. Returns the curve (minutes, AP), images seen, and
-    scores.
+    """Run `cohdc fit` and score its last.ckpt.
+
+    Returns the curve (minutes, AP), images seen, and scores.
     """
     from cohdc_train.train.cli import fit
     from cohdc_train.train.module import MaskRCNNModule
@@ -247,17 +247,17 @@ def score_ours(module: Any, data: Path) -> dict[str, float]:
 
     from cohdc_train.data.annotations import read_image
     from cohdc_train.data.datamodule import CocoDataModule
-    from cohdc_train.metrics.coco_metrics import encode
-    from cohdc_train.models import detect, fused
+    from cohdc_train.metrics.detection_rows import encode_detections
+    from cohdc_train.models import detect, fuse_conv_bn
 
     split = CocoDataModule(data, module.class_names).folder.val
-    network = fused(module.network)
+    network = fuse_conv_bn(module.network)
     images = Images(split, flip=0.0)
     rows: list[dict[str, Any]] = []
     for image in split.images:
         pixels = torch.from_numpy(read_image(image)).permute(2, 0, 1)
         (detections,) = detect(network, [pixels])
-        for row in encode(image.id, (image.height, image.width), detections):
+        for row in encode_detections(image.id, (image.height, image.width), detections):
             label = row["category_id"]
             wanted = {key: row[key] for key in ("image_id", "bbox", "segmentation")}
             rows.append(
@@ -273,8 +273,9 @@ def score_ours(module: Any, data: Path) -> dict[str, float]:
 def train_torchvision(
     data: Path, imagenet: Path, minutes: float, seed: int, rate: float, has_short_warmup: bool
 ) -> tuple[list[tuple[float, float]], int, dict[str, float]]:
-    """Train torchvision's Mask R-CNN of the same parts by its recipe, for so many minutes. Returns
-    as train_ours.
+    """Train torchvision's Mask R-CNN of the same parts by its recipe, for some minutes.
+
+    Returns as train_ours.
     """
     import reference_loops
     import torch
@@ -306,22 +307,22 @@ def train_torchvision(
     )
     warmup_steps = min(1000, len(loader) - 1)
 
-    budget, spent, step, curve = 60 * minutes, 0.0, 0, []
+    budget, elapsed, step, curve = 60 * minutes, 0.0, 0, []
     scores: dict[str, float] = {}
     while True:
-        for pictures, targets in loader:
+        for batch, targets in loader:
             started = time.monotonic()
             for group in optimizer.param_groups:
                 warmup = (
-                    spent / budget / SHORT_WARMUP
+                    elapsed / budget / SHORT_WARMUP
                     if has_short_warmup
                     else step / max(1, warmup_steps)
                 )
-                group["lr"] = rate * recipe_factor(warmup, spent / budget)
-            losses = sum(network(list(pictures), [dict(target) for target in targets]).values())
+                group["lr"] = rate * recipe_factor(warmup, elapsed / budget)
+            losses = sum(network(list(batch), [dict(target) for target in targets]).values())
             if not torch.isfinite(losses):
                 return (
-                    [*curve, (spent / 60, 0.0)],
+                    [*curve, (elapsed / 60, 0.0)],
                     step * BATCH_SIZE,
                     {"AP": 0.0, "AP50": 0.0, "box_AP": 0.0},
                 )
@@ -329,20 +330,19 @@ def train_torchvision(
             losses.backward()
             optimizer.step()
             step += 1
-            spent += time.monotonic() - started
-            if spent >= budget * (len(curve) + 1) / POINTS or spent >= budget:
+            elapsed += time.monotonic() - started
+            if elapsed >= budget * (len(curve) + 1) / POINTS or elapsed >= budget:
                 scores = score_torchvision(
                     network, val_images, [image.id for image in validation.images]
                 )
-                curve.append((spent / 60, scores["AP"]))
+                curve.append((elapsed / 60, scores["AP"]))
                 network.train()
-            if spent >= budget:
+            if elapsed >= budget:
                 return curve, step * BATCH_SIZE, scores
 
 
 def recipe_factor(warmup: float, progress: float) -> float:
-    """Return the share of the rate: torchvision's linear warm-up, and its drops at epochs 16 and 22
-    of 26.
+    """Return the share of the rate: linear warm-up, and drops at epochs 16 and 22 of 26.
 
     warmup: share of the warm-up that is over; progress: share of the budget that is used.
     """
@@ -358,17 +358,15 @@ def score_torchvision(network: Any, images: Any, image_ids: list[int]) -> dict[s
     network.eval()
     rows: list[dict[str, Any]] = []
     for image_id in image_ids:
-        picture, _ = images[images.coco.ids.index(image_id)]
+        image, _ = images[images.coco.ids.index(image_id)]
         with torch.inference_mode():
-            (found,) = network([picture])
+            (found,) = network([image])
         rows += reference_loops.result_rows(image_id, found, images.category)
     return reference_loops.coco_scores(images, image_ids, rows)
 
 
 def as_table(cells: list[dict[str, Any]]) -> str:
-    """Return a Markdown table: one row per set and budget, mask AP / AP50 of every contender, mean
-    over seeds.
-    """
+    """Format one row per set and budget: mask AP / AP50 of each contender, mean over seeds."""
     import numpy as np
 
     names = [name for name in contenders() if any(cell["contender"] == name for cell in cells)]

@@ -57,7 +57,7 @@ def main() -> int:
 def add_folder(
     folder: Path, target: Path, images: list[dict[str, Any]], annotations: list[dict[str, Any]]
 ) -> None:
-    """Append a folder's training images and person annotations under new ids, and link its images."""
+    """Append a folder's training images and people under new ids, and link its images."""
     coco = json.loads((folder / "instances_train.json").read_text(encoding="utf-8"))
     person = next(row["id"] for row in coco["categories"] if row["name"] == CLASS)
     new_ids: dict[int, int] = {}

@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""The person networks of the HDC-Net family, from photographs and rendered people to a scored int8
-file.
+"""Person networks of the HDC-Net family: from photographs to a scored int8 file.
 
     tools/experiments/person_model.py n --data COCO_SMALL --out DIR
         [--weights BACKBONE.pth | --pretrained person [--mean]]
@@ -8,8 +7,8 @@ file.
 Renders DIR/synth and, with people close to the camera, DIR/near, trains DIR/fit, exports
 DIR/person.onnx and person.int8.onnx, calibrated on training photographs, and writes the scores of
 both on the validation photographs to DIR/scores.json. What is trained already is not trained again.
-With --minutes 0 nothing is trained: --pretrained is written anew, as the package exports and
-quantises now.
+With --minutes 0 nothing is trained: --pretrained is written again, as the package exports and
+quantizes now.
 """
 
 import argparse
@@ -20,7 +19,7 @@ from typing import Any
 import torch
 import yaml
 
-from cohdc_train.bench.training import budget, train
+from cohdc_train.bench.training import budget_arguments, train
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.exporter.export import export
 from cohdc_train.files import write_json
@@ -97,8 +96,9 @@ def main() -> None:
 
 
 def trained(arguments: argparse.Namespace, data: Path, out: Path, canvas: tuple[int, int]) -> Path:
-    """The checkpoint of a training on photographs and rendered people, or, with --mean, of the
-    weights halfway.
+    """Train on photographs and rendered people; returns the checkpoint.
+
+    With --mean it holds the mean of first and last weights.
     """
     if not (out / "synth").is_dir():
         coco(out / "synth", train=64, val=8, size=(384, 512), seed=7)
@@ -108,7 +108,7 @@ def trained(arguments: argparse.Namespace, data: Path, out: Path, canvas: tuple[
     options = (
         *(f"--config=networks/hdc_net_{arguments.size}.yaml", "--config=person.yaml", start),
         *(f"--seed_everything={arguments.seed}", f"--data.canvas=[{canvas[0]}, {canvas[1]}]"),
-        *budget(arguments.epochs or 28, arguments.minutes),
+        *budget_arguments(arguments.epochs or 28, arguments.minutes),
         *([f"--model.optimizer.lr={arguments.lr}"] if arguments.lr else []),
     )
     checkpoint = train(
@@ -120,25 +120,25 @@ def trained(arguments: argparse.Namespace, data: Path, out: Path, canvas: tuple[
 
 
 def untrained(size: str, canvas: tuple[int, int], began: Path, out: Path) -> Path:
-    """A checkpoint of weights as they are, in the network of a size."""
+    """Write a checkpoint of weights as they are, in the network of a size."""
     shape: dict[str, Any] = {}
     for name in (f"networks/hdc_net_{size}.yaml", "person.yaml"):
         shape |= yaml.safe_load(config_path(name).read_text(encoding="utf-8"))["model"]["network"]
     fields = {**shape, "norm": "frozen", "frozen_stages": 2, "canvas": canvas}
     module = MaskRCNNModule(["person"], NetworkConfig(**fields))
-    module.take_over(began)
+    module.load_pretrained(began)
     torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, out)
     return out
 
 
 def mean_with_start(ended: Path, began: Path, out: Path) -> Path:
-    """A checkpoint of the weights halfway from those a training began with to those it ended with."""
+    """Write a checkpoint of the mean of the weights before and after a training."""
     module, stored = (
         MaskRCNNModule.load(ended),
         torch.load(ended, map_location="cpu", weights_only=True),
     )
     last = {name: weights.clone() for name, weights in module.network.state_dict().items()}
-    module.take_over(began)
+    module.load_pretrained(began)
     for name, weights in module.network.state_dict().items():
         if weights.is_floating_point():
             stored["state_dict"][f"network.{name}"] = (weights + last[name]) / 2

@@ -1,6 +1,4 @@
-"""Torchvision's detection training and evaluation, in our own words: what the experiments compare
-with.
-"""
+"""Torchvision's detection training and evaluation, rewritten for comparisons."""
 
 import argparse
 import contextlib
@@ -25,7 +23,7 @@ from cohdc_train.models.frozen_norm import FrozenNorm, plain_convolution
 def train(
     module: Any, data: Any, positions: list[int], args: argparse.Namespace, gate: Any
 ) -> None:
-    """What torchvision's references/detection does for one epoch, in our own words."""
+    """Train one epoch as torchvision's references/detection does, rewritten here."""
     network = same_network(module).train()
     split = data.folder.train[0]
     images = Images(split, flip=0.5)
@@ -43,8 +41,8 @@ def train(
         optimizer, 1e-3, total_iters=min(1000, len(loader) - 1)
     )
     gate.next()
-    for step, (pictures, targets) in enumerate(loader, 1):
-        losses = network(list(pictures), [dict(target) for target in targets])
+    for step, (batch, targets) in enumerate(loader, 1):
+        losses = network(list(batch), [dict(target) for target in targets])
         total = sum(losses.values())
         if not torch.isfinite(total):
             raise SystemExit(f"reference: loss {total.item()} at step {step}")
@@ -65,9 +63,9 @@ def validate(module: Any, data: Any, args: argparse.Namespace, gate: Any) -> Non
     while gate.next():
         rows: list[dict[str, Any]] = []
         for image_id in chosen:
-            picture, _ = images[images.coco.ids.index(image_id)]
+            image, _ = images[images.coco.ids.index(image_id)]
             with torch.inference_mode():
-                (found,) = network([picture])
+                (found,) = network([image])
             rows += result_rows(image_id, found, images.category)
         stats = {kind: coco_stats(images, chosen, rows, kind)[0] for kind in ("bbox", "segm")}
     print(f"reference: segm AP {stats['segm']:.3f}, box AP {stats['bbox']:.3f}", flush=True)
@@ -76,9 +74,7 @@ def validate(module: Any, data: Any, args: argparse.Namespace, gate: Any) -> Non
 def coco_scores(
     images: "Images", chosen: list[int], rows: list[dict[str, Any]]
 ) -> dict[str, float]:
-    """Return mask AP, mask AP50 and box AP by pycocotools over the chosen image ids; 0 without a
-    detection.
-    """
+    """Return mask AP, mask AP50 and box AP by pycocotools; 0 without a detection."""
     if not rows:
         return {"AP": 0.0, "AP50": 0.0, "box_AP": 0.0}
     masks, boxes = (coco_stats(images, chosen, rows, kind) for kind in ("segm", "bbox"))
@@ -88,9 +84,7 @@ def coco_scores(
 def coco_stats(
     images: "Images", chosen: list[int], rows: list[dict[str, Any]], kind: str
 ) -> list[float]:
-    """Return pycocotools' twelve figures of boxes ("bbox") or masks ("segm") over the chosen image
-    ids.
-    """
+    """Return pycocotools' twelve figures of boxes ("bbox") or masks ("segm") of some images."""
     other = "bbox" if kind == "segm" else "segmentation"
     truth = images.coco.coco
     with contextlib.redirect_stdout(io.StringIO()):
@@ -106,7 +100,7 @@ def coco_stats(
 def result_rows(
     image_id: int, found: dict[str, Any], category: dict[int, int]
 ) -> Iterator[dict[str, Any]]:
-    """COCO result rows of torchvision's detections of one image, masks pasted by it."""
+    """Make COCO result rows of one image, masks pasted by torchvision."""
     for box, label, score, mask in zip(
         *(found[key] for key in ("boxes", "labels", "scores", "masks")), strict=True
     ):
@@ -118,22 +112,25 @@ def result_rows(
 
 
 class Images:
-    """CocoDetection with polygons turned into masks at the image's size, as (float image, target)."""
+    """CocoDetection with polygons turned into masks, as (float image, target)."""
 
     def __init__(self, split: Any, flip: float) -> None:
+        """Open a split; flip: probability of a horizontal flip."""
         self.coco = CocoDetection(str(split.images[0].path.parent), str(split.annotations))
         ids = {row["name"]: row["id"] for row in self.coco.coco.cats.values()}
         self.category = {i: ids[name] for i, name in enumerate(split.class_names, 1)}
         self.flip = flip
 
     def __len__(self) -> int:
+        """Return the number of images."""
         return len(self.coco)
 
     def __getitem__(self, index: int) -> tuple[Any, dict[str, Any]]:
-        picture, rows = self.coco[index]
+        """Load an image and its target."""
+        pixels, rows = self.coco[index]
         label = {number: i for i, number in self.category.items()}
         rows = [row for row in rows if row["iscrowd"] == 0 and row["category_id"] in label]
-        width, height = picture.size
+        width, height = pixels.size
         boxes = torch.tensor([row["bbox"] for row in rows], dtype=torch.float32).reshape(-1, 4)
         boxes[:, 2:] += boxes[:, :2]
         boxes[:, 0::2].clamp_(0, width)
@@ -148,7 +145,7 @@ class Images:
         )
         labels = torch.tensor([label[row["category_id"]] for row in rows], dtype=torch.int64)
         keep = (boxes[:, 2:] > boxes[:, :2]).all(dim=1)
-        image, boxes, stacked = pil_to_tensor(picture), boxes[keep], stacked[keep]
+        image, boxes, stacked = pil_to_tensor(pixels), boxes[keep], stacked[keep]
         if self.flip and torch.rand(1) < self.flip:
             image, stacked = horizontal_flip(image), stacked.flip(-1)
             boxes[:, [0, 2]] = width - boxes[:, [2, 0]]
@@ -173,9 +170,7 @@ def with_torchvision_norms(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def same_network(module: Any) -> Any:
-    """Build torchvision's Mask R-CNN of the same parts and weights; every image is resized to the
-    canvas.
-    """
+    """Build torchvision's Mask R-CNN of the same parts and weights, resizing to the canvas."""
     ours, config = module.network, module.network_config
     with_torchvision_norms(ours)
     heads = ours.roi_heads

@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""A start for ResNet-101 where only ResNet-50's ImageNet weights can be had: the blocks that both
-have, and copies.
+"""Start weights for ResNet-101 from ResNet-50's: the blocks that both have, and copies.
 
     tools/experiments/resnet101_start.py RESNET50.pth OUT.pth
 

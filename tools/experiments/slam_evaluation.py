@@ -3,7 +3,7 @@
 plain walls and more.
 
     tools/experiments/slam_evaluation.py --root DIR --out OUT [--model person] [--seeds 0 1 2]
-        [--method loops=false ...]
+        [--settings loops.enabled=false ...]
 
 Renders what is missing of the sequences below DIR (12 of --frames frames, the loop twice as long),
 then runs `cohdc slam` in process on each: without masks ("none"), with the true people ("masks"),
@@ -22,15 +22,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
 import cohdc_train.slam
 from cohdc_train.errors import CohdcError
 from cohdc_train.files import sha256, write_json, write_text
 from cohdc_train.presets import model_path
-from cohdc_train.slam.run import slam
+from cohdc_train.slam.config import SlamConfig
+from cohdc_train.slam.run import run_slam
 from cohdc_train.synth.camera_motion import CameraMotion
-from cohdc_train.synth.scenario import Setting
+from cohdc_train.synth.scenario import SceneConfig
 from cohdc_train.synth.sequence import sequence
 
 Row = dict[str, Any]
@@ -45,19 +46,19 @@ class Kind:
     seed: int
     motion: CameraMotion
     people: int
-    scene: Setting = Setting()  # noqa: RUF009 - frozen
+    scene: SceneConfig = SceneConfig()  # noqa: RUF009 - frozen
     length: int = 1
 
 
 KINDS = {
-    "rolling_cart": Kind(101, "xyz", 0, Setting(cart="alone")),
-    "pushed_cart": Kind(102, "halfsphere", 2, Setting(cart="pushed")),
+    "rolling_cart": Kind(101, "xyz", 0, SceneConfig(cart="alone")),
+    "pushed_cart": Kind(102, "halfsphere", 2, SceneConfig(cart="pushed")),
     "loop": Kind(103, "loop", 2, length=2),
     "crowd": Kind(104, "xyz", 9),
-    "plain_wall": Kind(105, "xyz", 2, Setting(walls="plain")),
-    "filled_view": Kind(106, "xyz", 3, Setting(action="fill_view")),
-    "stop_and_go": Kind(107, "halfsphere", 3, Setting(action="stop_and_go")),
-    "sitting": Kind(108, "halfsphere", 3, Setting(action="sit")),
+    "plain_wall": Kind(105, "xyz", 2, SceneConfig(walls="plain")),
+    "filled_view": Kind(106, "xyz", 3, SceneConfig(action="fill_view")),
+    "stop_and_go": Kind(107, "halfsphere", 3, SceneConfig(action="stop_and_go")),
+    "sitting": Kind(108, "halfsphere", 3, SceneConfig(action="sit")),
     "walking_xyz": Kind(109, "xyz", 3),
     "walking_halfsphere": Kind(110, "halfsphere", 3),
     "walking_static": Kind(111, "static", 3),
@@ -69,7 +70,7 @@ def main() -> None:
     """Render, run, write."""
     arguments = parse()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    code = digest(Path(cohdc_train.slam.__path__[0]).glob("*.py"))
+    code = digest(Path(cohdc_train.slam.__path__[0]).rglob("*.py"))
     rows, failures = kept(arguments.out / "evaluation.json", code), []
     for name in arguments.sequences:
         frames = KINDS[name].length * arguments.frames
@@ -79,7 +80,7 @@ def main() -> None:
                 "sequence": name,
                 "mode": mode,
                 "seed": seed,
-                "method": asdict(arguments.method),
+                "settings": arguments.settings,
             }
             asked |= {"frames": frames, "size": list(arguments.size), "code": code}
             asked |= {"model": sha256(model_path(arguments.model))} if mode == "model" else {}
@@ -98,7 +99,7 @@ def main() -> None:
 
 
 def parse() -> argparse.Namespace:
-    """The arguments; `method` is a Method, `modes` those that can run."""
+    """Return the arguments; `modes` are those that can run."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -114,7 +115,7 @@ def parse() -> argparse.Namespace:
         "--model", type=Path, help="ONNX or a shipped network's name; without it, no mode `model`"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    add_method_option(parser)
+    add_settings_option(parser)
     parser.add_argument("--frames", type=int, default=200, help="of a sequence of length 1")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(480, 640), metavar=("HEIGHT", "WIDTH")
@@ -167,7 +168,8 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
     given: Row = {"model": arguments.model} if mode == "model" else {}
     given |= {"masks": folder / mode} if mode in ("masks", "movers") else {}
     out = arguments.out / name / f"{mode}_seed{seed}"
-    metrics = slam(sequence=folder, out=out, seed=seed, method=arguments.method, **given)
+    settings = SlamConfig(seed=seed).override(arguments.settings)
+    metrics = run_slam(folder, out, settings=settings, **given)
     row = {
         error: metrics.get(error, {}).get("rmse") for error in ("ate_m", "rpe_1s_m", "rpe_1s_deg")
     }
@@ -175,12 +177,12 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
 
 
 def tables(rows: list[Row]) -> str:
-    """A table per method: ATE RMSE of every sequence and mode, median and worst over the seeds, and
+    """Return a table per choice of settings: ATE RMSE of every sequence and mode, median and worst over the seeds, and
     coverage.
     """
     parts = []
-    for method in unique(json.dumps(row["method"]) for row in rows):
-        ours = [row for row in rows if json.dumps(row["method"]) == method]
+    for settings in unique(json.dumps(row["settings"]) for row in rows):
+        ours = [row for row in rows if json.dumps(row["settings"]) == settings]
         modes = [mode for mode in MODES if any(row["mode"] == mode for row in ours)]
         lines = [
             "| ATE RMSE m, median (worst), least coverage | " + " | ".join(modes) + " |",
@@ -192,8 +194,8 @@ def tables(rows: list[Row]) -> str:
                 for mode in modes
             ]
             lines.append(f"| {name} | {' | '.join(cells)} |")
-        switches = ", ".join(f"{key} {value}" for key, value in json.loads(method).items())
-        parts.append(f"### {switches}\n\n" + "\n".join(lines) + "\n")
+        changed = ", ".join(f"{key} {value}" for key, value in json.loads(settings).items())
+        parts.append(f"### {changed or 'default settings'}\n\n" + "\n".join(lines) + "\n")
     return "\n".join(parts)
 
 

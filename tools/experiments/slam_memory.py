@@ -3,13 +3,13 @@
 synchronously.
 
     tools/experiments/slam_memory.py --sequence DIR --out OUT [--frames 18000] [--features 500]
-        [--shrink 2] [--method KEY=VALUE ...]
+        [--shrink 2] [--settings OPTION=VALUE ...]
 
 Frames come at 30 a second, images a --shrink-th as wide and high; they are read into memory first.
 A line every --every frames: resident memory beyond that before the first frame, keyframes and
 points the map holds, keyframes made since the line before, and CPU time per frame. Results go to
 OUT as `cohdc slam` writes them; the truth goes forth and back, too. Rolling shutter and the time
-between colour and depth are left out, for they would be wrong on the way back.
+between color and depth are skipped, for they would be wrong on the way back.
 """
 
 import argparse
@@ -21,16 +21,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from slam_method import add_method_option
+from slam_settings import add_settings_option
 
-from cohdc_train.slam.frame import FrameRecord, View
+from cohdc_train.slam.config import SlamConfig
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Recorded
-from cohdc_train.slam.run import run_source
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.io.sources import RecordedSequence
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.run import run_slam
 from cohdc_train.trajectory.association import associate
-from cohdc_train.trajectory.trajectory import Trajectory, read_tum, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 RATE = 30  # frames per second
 
@@ -47,14 +48,14 @@ def main() -> None:
     parser.add_argument("--shrink", type=int, default=2)
     parser.add_argument("--every", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
-    add_method_option(parser)
+    add_settings_option(parser)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     source = ForthAndBack(arguments.sequence, arguments.frames, arguments.shrink, arguments.out)
-    options = {"out": arguments.out / "run", "seed": arguments.seed, "features": arguments.features}
-    metrics = run_source(
-        source, method=arguments.method, observers=[Table(arguments.every)], **options
-    )
+    options = {"features.max_keypoints": arguments.features, **arguments.settings}
+    settings = SlamConfig(seed=arguments.seed).override(options)
+    out = arguments.out / "run"
+    metrics = run_slam(source, out, settings=settings, observers=[Table(arguments.every)])
     print(f"ATE RMSE {metrics['ate_m']['rmse']:.4f} m, coverage {100 * metrics['coverage']:.1f} %")
 
 
@@ -63,41 +64,35 @@ class ForthAndBack:
 
     def __init__(self, folder: Path, frames: int, shrink: int, out: Path) -> None:
         camera, _ = choose_camera(folder, None)
-        recorded = Recorded(folder, camera)
+        recorded = RecordedSequence(folder, camera)
         self.camera = shrunk(camera, shrink)
-        self.without_depth = 0
+        self.num_unpaired = 0
         self._images, stamps = [], []
         for view in recorded:
             self._images.append(small(view, self.camera, shrink))
-            stamps.append(view.t)
+            stamps.append(view.timestamp)
         count = len(stamps)
         period = [*range(count), *range(count - 2, 0, -1)]
         self._order = [period[i % len(period)] for i in range(frames)]
         self.groundtruth: Path | None = None
         if recorded.groundtruth is not None:
             self.groundtruth = out / "groundtruth.txt"
-            write_tum(
-                self.groundtruth, self._truth(read_tum(recorded.groundtruth), np.array(stamps))
-            )
+            truth = Trajectory.load_tum(recorded.groundtruth)
+            self._truth(truth, np.array(stamps)).save_tum(self.groundtruth)
 
     def __len__(self) -> int:
         return len(self._order)
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         for number, place in enumerate(self._order):
             rgb, depth = self._images[place]
             t = number / RATE
-            yield View(
-                t,
-                f"{t:.6f}",
-                f"{number}",
-                rgb.copy(),
-                depth.astype(np.float32) / self.camera.depth_scale,
-            )
+            meters = depth.astype(np.float32) / self.camera.depth_scale
+            yield RGBDFrame(t, rgb.copy(), meters, name=f"{number}")
 
     def _truth(self, truth: Trajectory, stamps: np.ndarray) -> Trajectory:
         """The pose nearest in time to every image, at the times they are played."""
-        row = dict(associate(stamps, truth.stamps, 0.02).tolist())
+        row = dict(associate(stamps, truth.timestamps, 0.02).tolist())
         known = [
             (number / RATE, row[place]) for number, place in enumerate(self._order) if place in row
         ]
@@ -110,11 +105,11 @@ def shrunk(camera: Camera, by: int) -> Camera:
     c = camera
     cx, cy = (c.cx + 0.5) / by - 0.5, (c.cy + 0.5) / by - 0.5
     size = {"width": c.width // by, "height": c.height // by}
-    return replace(c, fx=c.fx / by, fy=c.fy / by, cx=cx, cy=cy, readout=0.0, **size)
+    return replace(c, fx=c.fx / by, fy=c.fy / by, cx=cx, cy=cy, readout_s=0.0, **size)
 
 
-def small(view: View, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, and depth as it is stored."""
+def small(view: RGBDFrame, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return color, and depth as it is stored."""
     rgb = cv2.resize(view.rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return rgb, np.rint(view.depth[by // 2 :: by, by // 2 :: by] * camera.depth_scale).astype(
         np.uint16
@@ -135,13 +130,13 @@ class Table:
         )
         print("|---|---|---|---|---|---|---|", flush=True)
 
-    def __call__(self, view: View, mask: object, record: FrameRecord, tracker: Tracker) -> None:
+    def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
         """Count the frame."""
         self._frames += 1
-        self._made += record.pose.keyframe
+        self._made += result.is_keyframe
         if self._frames % self._every:
             return
-        cpu, world = time.process_time(), tracker.map
+        cpu, world = time.process_time(), point_map
         points = np.count_nonzero(world.num_observations[: world.size])
         cells = [self._frames, f"{self._frames / RATE / 60:.1f}", f"{resident() - self._start:.0f}"]
         cells += [

@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Table 4's real photographs: vehicles and people of two COCO-format folders as one folder of three
-classes.
+"""Real photographs for Table 4: vehicles and people of two COCO-format folders.
 
     tools/experiments/table4_data.py COCO_SMALL COAD_VEHICLES OUT
 
 COCO's cars, buses and trucks become "vehicle", as the street photographs call them. Every other
-class is left out; photographs of nothing else stay, as background. Images are hard links where
+class is skipped; photographs of nothing else stay, as background. Images are hard links where
 possible: do not edit them.
 """
 
@@ -43,15 +42,12 @@ def main() -> None:
                 add(joined, source, name, draft / "images")
             write_json(draft / f"instances_{name}.json", joined)
             split = read_split(name, find_split(draft, name))
-            print(
-                f"{name}: {len(split.images)} images, {sum(len(i.objects) for i in split.images)} objects"
-            )
+            num_objects = sum(len(image.objects) for image in split.images)
+            print(f"{name}: {len(split.images)} images, {num_objects} objects")
 
 
 def add(joined: dict[str, list[Any]], source: Path, name: str, images: Path) -> None:
-    """A source's split at the end of a COCO dict, under new ids and file names; its images beside
-    those there.
-    """
+    """Append a source's split to a COCO dict under new ids and file names, and link its images."""
     files = find_split(source, name)
     content = read_json(files.annotations)
     classes = {

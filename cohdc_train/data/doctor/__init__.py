@@ -1,1 +1,1 @@
-"""Faults of a COCO-format folder, and their fixes."""
+"""Find what is wrong with a COCO-format folder, and fix it."""

@@ -1,23 +1,26 @@
-"""How well anchors of given scales cover the objects of a folder (numpy, no torch)."""
+"""Measure how well anchors of given scales cover the objects of a folder (numpy, no torch)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from cohdc_train.types import FloatArray
 
 STRIDES = (4, 8, 16, 32, 64)  # px, of the pyramid's levels
 RATIOS = (0.5, 1.0, 2.0)  # height / width
-SIZES = {
-    "small": (0.0, 32.0),
-    "medium": (32.0, 96.0),
-    "large": (96.0, np.inf),
-}  # px, COCO's, of sqrt(area)
+# COCO's, px of sqrt(area)
+SIZES = {"small": (0.0, 32.0), "medium": (32.0, 96.0), "large": (96.0, np.inf)}
 
 
 class AnchorRecall(NamedTuple):
-    """Objects of one size on the canvas, and the share of them that an anchor covers at IoU .5 and
-    .7.
+    """Share of the objects of one size that an anchor covers.
+
+    Attributes:
+        size: "small", "medium", "large" or "all".
+        objects: number of objects.
+        at_50: share of them that an anchor covers at an IoU of .5 or more.
+        at_70: the same at .7.
     """
 
     size: str
@@ -26,13 +29,18 @@ class AnchorRecall(NamedTuple):
     at_70: float
 
 
-def best_overlap(
-    boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]
-) -> NDArray[np.float64]:
-    """The largest IoU of each box with an anchor of torchvision's grid: one scale per level from
-    stride 4, 3 ratios.
+def best_overlap(boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, int]) -> FloatArray:
+    """Return the largest IoU of each box with an anchor of torchvision's grid.
 
-    boxes: [N, 4] xyxy, px on the canvas; canvas: (height, width), px. Returns [N].
+    Anchors have one scale per level from stride 4 on, and 3 ratios.
+
+    Args:
+        boxes: [N, 4] xyxy, px on the canvas.
+        scales: side of the anchors of each level, px.
+        canvas: (height, width), px.
+
+    Returns:
+        [N], 0..1.
     """
     best = np.zeros(len(boxes))
     for scale, stride in zip(scales, STRIDES, strict=False):
@@ -40,22 +48,22 @@ def best_overlap(
         for ratio in RATIOS:
             # torchvision rounds half an anchor's sides to whole px
             half = np.round(np.array([scale / np.sqrt(ratio), scale * np.sqrt(ratio)]) / 2)
-            centre = (
+            center = (
                 np.round((boxes[:, :2] + boxes[:, 2:]) / 2 / stride).clip(0, steps - 1) * stride
             )
             best = np.maximum(
-                best, _iou(boxes, np.concatenate([centre - half, centre + half], axis=1))
+                best, _iou(boxes, np.concatenate([center - half, center + half], axis=1))
             )
     return best
 
 
-def recall(
-    boxes: NDArray[np.float64], scales: Sequence[int], canvas: tuple[int, int]
+def anchor_recall(
+    boxes: FloatArray, scales: Sequence[int], canvas: tuple[int, int]
 ) -> list[AnchorRecall]:
-    """Anchor-to-object recall by size. boxes, canvas: as `best_overlap` takes them; sizes without
-    objects are left out.
+    """Return the share of objects that anchors cover, by the objects' size.
 
-    RPN training calls an anchor positive from IoU .7, and takes an object's best one in any case.
+    Sizes without objects are skipped. RPN training calls an anchor positive from an IoU of .7 on,
+    and also takes the best anchor of each object. Arguments are those of `best_overlap`.
     """
     overlap = best_overlap(boxes, scales, canvas)
     side = np.sqrt((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]))
@@ -71,10 +79,10 @@ def recall(
     return rows
 
 
-def _iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """IoU of boxes [N, 4] xyxy, pair by pair."""
+def _iou(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the IoU of boxes [N, 4] xyxy, pair by pair."""
     inside = (np.minimum(a[:, 2:], b[:, 2:]) - np.maximum(a[:, :2], b[:, :2])).clip(0).prod(axis=1)
     areas = [(box[:, 2:] - box[:, :2]).prod(axis=1) for box in (a, b)]
     union = areas[0] + areas[1] - inside
-    iou: NDArray[np.float64] = np.divide(inside, union, out=np.zeros_like(inside), where=union > 0)
+    iou: FloatArray = np.divide(inside, union, out=np.zeros_like(inside), where=union > 0)
     return iou

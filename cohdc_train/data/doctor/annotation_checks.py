@@ -1,6 +1,4 @@
-"""One annotation of a COCO-format file under the magnifying glass: what is wrong with it, and its
-mended row.
-"""
+"""Check one annotation of a COCO-format file, and fix its row (no torch)."""
 
 from typing import Any, NamedTuple
 
@@ -8,65 +6,68 @@ import numpy as np
 from pycocotools import mask as rle
 from shapely import Polygon, box, clip_by_rect, get_parts
 
-from cohdc_train.data.annotations import fills, is_crowd, is_numbers
+from cohdc_train.data.annotations import fills_image, is_crowd, is_number_list, rle_as_text
 
-_TOLERANCE = 1.0  # px that a box or contour may reach out of the image, or a box be off, before it is a finding
-_DISAGREE, _AGREE = (
-    0.5,
-    0.9,
-)  # IoU of annotated box and contour's box: below is wrong; above, as corners, is a mix-up
-_TINY = 4  # px
+_TOLERANCE = 1.0  # px by which a box may be wrong, or a box or contour leave the image
+# IoU of the annotated box with the contour's box. Below the first the box is wrong; above the
+# second, read as corners, the corners were written in place of width and height.
+_DISAGREE, _AGREE = 0.5, 0.9
+_TINY = 4  # px^2
 Box = tuple[float, float, float, float]
 
 
-class Examined(NamedTuple):
-    """findings: kinds. row: the mended annotation, None when it has to go. shape: its compressed
-    RLE, None likewise.
+class AnnotationReport(NamedTuple):
+    """Result of the checks of one annotation.
+
+    Attributes:
+        issues: kinds of issues.
+        row: the fixed annotation; None when it has to be removed.
+        shape: its compressed RLE; None when it has none.
     """
 
-    findings: list[str]
+    issues: list[str]
     row: dict[str, Any] | None
     shape: dict[str, Any] | None
 
 
-def examine(row: dict[str, Any], height: int, width: int) -> Examined:
-    """Look at segmentation, box and area of one annotation of an image of height x width px."""
-    findings: list[str] = []
+def check_annotation(row: dict[str, Any], height: int, width: int) -> AnnotationReport:
+    """Check segmentation, box and area of one annotation of an image of height x width px."""
+    issues: list[str] = []
     crowd = is_crowd(row)
     if crowd:
-        findings.append("crowd")
+        issues.append("crowd")
     segmentation = row.get("segmentation")
     if not segmentation:
-        if crowd and is_numbers(row.get("bbox"), 4):
-            return Examined(findings, row, None)
-        return Examined([*findings, "contour-missing"], None, None)
-    kinds, mended = _mend_segmentation(segmentation, height, width)
-    findings += kinds
-    if mended is None:
-        return Examined(findings, None, None)
-    shape = (
-        mended if isinstance(mended, dict) else rle.merge(rle.frPyObjects(mended, height, width))
-    )
+        if crowd and is_number_list(row.get("bbox"), 4):
+            return AnnotationReport(issues, row, None)
+        return AnnotationReport([*issues, "contour-missing"], None, None)
+    kinds, fixed = _fix_segmentation(segmentation, height, width)
+    issues += kinds
+    if fixed is None:
+        return AnnotationReport(issues, None, None)
+    shape = fixed if isinstance(fixed, dict) else rle.merge(rle.frPyObjects(fixed, height, width))
     pixels = int(rle.area(shape))
     if pixels == 0:
-        return Examined([*findings, "contour-empty"], None, None)
+        return AnnotationReport([*issues, "contour-empty"], None, None)
     if pixels < _TINY:
-        findings.append("object-tiny")
+        issues.append("object-tiny")
     tight: Box = tuple(float(v) for v in rle.toBbox(shape))  # type: ignore[assignment]
-    kinds, bounds = _mend_box(row.get("bbox"), tight, height, width)
-    findings += kinds
+    kinds, bounds = _fix_box(row.get("bbox"), tight, height, width)
+    issues += kinds
     area = row.get("area")
     if not isinstance(area, int | float) or not pixels / 2 <= area <= pixels * 2:
-        findings += ["area-wrong"] if area is not None and pixels >= _TINY else []
+        if area is not None and pixels >= _TINY:
+            issues.append("area-wrong")
         area = float(pixels)
-    return Examined(
-        findings, row | {"segmentation": mended, "bbox": list(bounds), "area": area}, shape
+    return AnnotationReport(
+        issues, row | {"segmentation": fixed, "bbox": list(bounds), "area": area}, shape
     )
 
 
-def fits(row: dict[str, Any], height: int, width: int) -> bool:
-    """Whether an annotation could be of an image of this size: its RLE's size is the same, or its
-    points lie inside.
+def fits_image(row: dict[str, Any], height: int, width: int) -> bool:
+    """Return whether an annotation could be of an image of this size.
+
+    It could when its RLE has the same size, or when its points lie inside.
     """
     segmentation = row.get("segmentation") or []
     if isinstance(segmentation, dict):
@@ -83,42 +84,42 @@ def fits(row: dict[str, Any], height: int, width: int) -> bool:
     )
 
 
-def _mend_segmentation(given: Any, height: int, width: int) -> tuple[list[str], Any]:
-    """Kinds of findings, and polygons or a compressed RLE; None when nothing is left."""
+def _fix_segmentation(given: Any, height: int, width: int) -> tuple[list[str], Any]:
+    """Return kinds of issues, and polygons or a compressed RLE; None when nothing is left."""
     if isinstance(given, dict):
-        return _mend_rle(given, height, width)
+        return _fix_rle(given, height, width)
     if not isinstance(given, list):
         return ["contour-format"], None
-    findings: list[str] = []
+    issues: list[str] = []
     if all(isinstance(value, int | float) for value in given):
-        findings.append("contour-flat")
+        issues.append("contour-flat")
         given = [given]
     polygons: list[list[float]] = []
     crossing = False
     for part in given:
-        fault = _fault(part)
+        fault = _polygon_fault(part)
         if fault:
-            findings.append(fault)
+            issues.append(fault)
             continue
         outline = Polygon(np.asarray(part, dtype=float).reshape(-1, 2))
         crossing |= not outline.is_valid and outline.area > 0
         inside = _clipped(part, outline, height, width)
         if inside is not None:
-            findings.append("contour-outside")
+            issues.append("contour-outside")
         polygons += [list(map(float, part))] if inside is None else inside
     if crossing and polygons:
-        findings.append("contour-crossing")
-        return findings, _text(rle.merge(rle.frPyObjects(polygons, height, width)))
-    if not polygons and "contour-outside" in findings:
-        findings.append("contour-empty")
-    return findings, polygons or None
+        issues.append("contour-crossing")
+        return issues, rle_as_text(rle.merge(rle.frPyObjects(polygons, height, width)))
+    if not polygons and "contour-outside" in issues:
+        issues.append("contour-empty")
+    return issues, polygons or None
 
 
-def _fault(part: Any) -> str:
-    """Why a polygon cannot be drawn; empty when it can."""
+def _polygon_fault(part: Any) -> str:
+    """Return why a polygon cannot be drawn; empty when it can."""
     if not isinstance(part, list):
         return "contour-format"
-    if not is_numbers(part, len(part)):
+    if not is_number_list(part, len(part)):
         return "contour-number"
     if len(part) % 2:
         return "contour-odd"
@@ -128,10 +129,9 @@ def _fault(part: Any) -> str:
 def _clipped(
     part: list[float], outline: Polygon, height: int, width: int
 ) -> list[list[float]] | None:
-    """What lies inside of the image of a polygon that reaches out of it; None when it does not
-    reach out.
+    """Return the part of a polygon that lies in the image; None when all of it does.
 
-    A crossing polygon, which shapely cannot cut, has its points moved to the edge.
+    A polygon that crosses itself, which shapely cannot clip, has its points moved to the border.
     """
     x0, y0, x1, y1 = outline.bounds
     if (
@@ -151,26 +151,29 @@ def _clipped(
     return [np.asarray(piece.exterior.coords)[:-1].ravel().tolist() for piece in pieces]
 
 
-def _mend_rle(
+def _fix_rle(
     given: dict[str, Any], height: int, width: int
 ) -> tuple[list[str], dict[str, Any] | None]:
     size, counts = given.get("size"), given.get("counts")
-    if not is_numbers(size, 2) or not isinstance(counts, str | bytes | list):
+    if not is_number_list(size, 2) or not isinstance(counts, str | bytes | list):
         return ["contour-format"], None
     if list(size) != [height, width]:  # type: ignore[arg-type]
         return ["rle-size"], None
-    if not fills(counts, height * width):
+    if not fills_image(counts, height * width):
         return ["rle-counts"], None
-    return [], _text(rle.frPyObjects(given, height, width) if isinstance(counts, list) else given)
+    return [], rle_as_text(
+        rle.frPyObjects(given, height, width) if isinstance(counts, list) else given
+    )
 
 
-def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str], Box]:
-    """Kinds of findings and the box to keep: the annotated one, clipped, unless the contour's is
-    the better.
+def _fix_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str], Box]:
+    """Return kinds of issues, and the box to keep.
+
+    It is the annotated box, clipped, unless the contour's box is the better one.
     """
     if given is None:
         return ["box-missing"], tight
-    if not is_numbers(given, 4):
+    if not is_number_list(given, 4):
         return ["box-degenerate"], tight
     x, y, w, h = (float(v) for v in given)
     if w < 0 or h < 0:
@@ -184,7 +187,7 @@ def _mend_box(given: Any, tight: Box, height: int, width: int) -> tuple[list[str
         min(y + h, height) - max(y, 0.0),
     )
     outside = max(-x, -y, x + w - width, y + h - height) > _TOLERANCE
-    if min(inside[2:]) > 0 and (_iou(inside, tight) >= _DISAGREE or _near(inside, tight)):
+    if min(inside[2:]) > 0 and (_iou(inside, tight) >= _DISAGREE or _is_near(inside, tight)):
         return ["box-outside"] if outside else [], inside
     corners = (x, y, w - x, h - y)
     if min(corners[2:]) > 0 and _iou(corners, tight) >= _AGREE:
@@ -197,18 +200,10 @@ def _iou(a: Box, b: Box) -> float:
     return float(one.intersection(other).area / max(one.union(other).area, 1e-9))
 
 
-def _near(a: Box, b: Box) -> bool:
-    """Whether no edge is off by more than the tolerance: of an object of a few px, one px is half
-    the IoU.
+def _is_near(a: Box, b: Box) -> bool:
+    """Return whether no edge of two boxes differs by more than the tolerance.
+
+    The IoU says little about objects of a few pixels: one pixel is half of it.
     """
     edges = [(v[0], v[1], v[0] + v[2], v[1] + v[3]) for v in (a, b)]
     return all(abs(one - other) <= _TOLERANCE for one, other in zip(*edges, strict=True))
-
-
-def _text(encoded: dict[str, Any]) -> dict[str, Any]:
-    """A compressed RLE whose counts are text, as JSON wants them."""
-    counts = encoded["counts"]
-    return {
-        "size": list(encoded["size"]),
-        "counts": counts.decode() if isinstance(counts, bytes) else counts,
-    }

@@ -1,4 +1,4 @@
-"""One split of a COCO-format folder, row by row: findings, and the mended rows (no torch)."""
+"""Check one split of a COCO-format folder row by row, and fix its rows (no torch)."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -7,57 +7,58 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as rle
 
 from cohdc_train.data.annotations import is_crowd
-from cohdc_train.data.doctor.annotation_checks import examine, fits
-from cohdc_train.data.doctor.issues import Findings
-from cohdc_train.data.image_files import ImageFile, fingerprint, look
+from cohdc_train.data.doctor.annotation_checks import check_annotation, fits_image
+from cohdc_train.data.doctor.issues import Issues
+from cohdc_train.data.image_files import ImageFile, fingerprint, read_image_file
 from cohdc_train.data.layout import SplitPaths, read_json
+from cohdc_train.types import Float32Array, Row
 
 _SAME_OBJECT = 0.95  # mask IoU
 _HUGE = 24_000_000  # px
 _CROWDED = 100  # objects
-Row = dict[str, Any]
 
 
 @dataclass
-class Inspection:
-    """What was seen in one split.
+class SplitReport:
+    """Result of the checks of one split.
 
     Attributes:
         name: "train" or "val".
-        files: where it lies.
-        findings: what is wrong.
-        content: the mended COCO dict.
+        files: the paths of its files.
+        issues: what is wrong.
+        content: the fixed COCO dict.
         removed: rows that are not in it, each with its `why`.
-        prints: fingerprint [256] of every readable image, by file name.
+        fingerprints: fingerprint [256] of every readable image, by file name.
     """
 
     name: str
     files: SplitPaths
-    findings: Findings = field(default_factory=Findings)
+    issues: Issues = field(default_factory=Issues)
     content: dict[str, Any] = field(default_factory=dict)
     removed: list[Row] = field(default_factory=list)
-    prints: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    fingerprints: dict[str, Float32Array] = field(default_factory=dict)
 
     def remove(self, why: str, row: Any) -> None:
-        """Keep a row that is left out of the mended content beside its reason."""
+        """Store a row that is not in the fixed content, with the reason."""
         self.removed.append({"why": why, "row": row})
 
-    def fault(self, kind: str, where: str, row: Any) -> None:
-        """A finding for which a row has to go."""
-        self.findings.add(kind, where)
+    def reject(self, kind: str, where: str, row: Any) -> None:
+        """Add an issue for which a row has to be removed."""
+        self.issues.add(kind, where)
         self.remove(kind, row)
 
 
-def inspect(name: str, files: SplitPaths) -> Inspection:
-    """Look at every category, image and annotation of a split. Raises DataError when the file is
-    not COCO format.
+def check_split(name: str, files: SplitPaths) -> SplitReport:
+    """Check every category, image and annotation of a split.
+
+    Raises:
+        DataError: the file is not COCO format.
     """
     given = read_json(files.annotations)
-    split = Inspection(name, files)
+    split = SplitReport(name, files)
     categories, join = _categories(split, given["categories"])
     rows = [row for row in given["annotations"] if _is_row(split, row)]
     images, joined = _images(split, given["images"], rows)
@@ -75,37 +76,33 @@ def inspect(name: str, files: SplitPaths) -> Inspection:
     return split
 
 
-def _is_row(split: Inspection, row: Any) -> bool:
+def _is_row(split: SplitReport, row: Any) -> bool:
     ids = ("id", "image_id", "category_id")
     if isinstance(row, dict) and not any(isinstance(row.get(key), list | dict) for key in ids):
         return True
-    split.fault("annotation-broken", f"{row!r:.40}", row)
+    split.reject("annotation-broken", f"{row!r:.40}", row)
     return False
 
 
-def _categories(split: Inspection, given: Sequence[Any]) -> tuple[list[Row], dict[int, int]]:
-    """The sound categories, and under which id each id that was given to a known name goes on."""
+def _categories(split: SplitReport, given: Sequence[Any]) -> tuple[list[Row], dict[int, int]]:
+    """Return the sound categories, and the first id of each name by every other id of that name."""
     kept: dict[int, Row] = {}
     first: dict[str, int] = {}
     join: dict[int, int] = {}
     for row in given:
-        if (
-            not isinstance(row, dict)
-            or not isinstance(row.get("id"), int)
-            or not str(row.get("name") or "").strip()
-        ):
-            split.fault("category-broken", f"{row!r:.40}", row)
+        if not _is_category(row):
+            split.reject("category-broken", f"{row!r:.40}", row)
             continue
         name, number = str(row["name"]), row["id"]
         if number in kept and kept[number]["name"] != name:
-            split.fault("category-id-twice", f"{number}: {kept[number]['name']}, {name}", row)
+            split.reject("category-id-twice", f"{number}: {kept[number]['name']}, {name}", row)
         elif name in first:
-            split.fault("category-name-twice", name, row)
+            split.reject("category-name-twice", name, row)
             join[number] = first[name]
         else:
             kept[number], first[name] = row, number
     if sorted(kept) != list(range(1, len(kept) + 1)):
-        split.findings.add(
+        split.issues.add(
             "category-gap",
             ", ".join(map(str, sorted(kept)[:8])) + (" ..." if len(kept) > 8 else ""),
         )
@@ -113,17 +110,13 @@ def _categories(split: Inspection, given: Sequence[Any]) -> tuple[list[Row], dic
 
 
 def _images(
-    split: Inspection, given: Sequence[Any], rows: Sequence[Row]
+    split: SplitReport, given: Sequence[Any], rows: Sequence[Row]
 ) -> tuple[dict[Any, Row], dict[Any, Any]]:
-    """The usable images by id, and under which id each image that is listed twice goes on."""
+    """Return the sound images by id; and the first id of a file by each other id of it."""
     by_id: dict[Any, list[Row]] = defaultdict(list)
     for row in given:
-        if (
-            not isinstance(row, dict)
-            or not row.get("file_name")
-            or not _whole(row, "id", "width", "height")
-        ):
-            split.fault("image-broken", f"{row!r:.60}", row)
+        if not _is_image(row):
+            split.reject("image-broken", f"{row!r:.60}", row)
         elif row not in by_id[row["id"]]:
             by_id[row["id"]].append(row)
     owned: dict[Any, list[Row]] = defaultdict(list)
@@ -135,48 +128,50 @@ def _images(
     for number, same in by_id.items():
         if len(same) > 1:
             for row in same:
-                split.fault("image-id-twice", str(row["file_name"]), row)
+                split.reject("image-id-twice", str(row["file_name"]), row)
             continue
         row = same[0]
         if row["file_name"] in first:
-            split.findings.add("image-listed-twice", row["file_name"])
+            split.issues.add("image-listed-twice", row["file_name"])
             split.remove("image-listed-twice", row)
             joined[number] = first[row["file_name"]]
-        elif (mended := _image(split, row, owned[number])) is not None:
-            kept[number], first[row["file_name"]] = mended, number
+        elif (fixed := _image(split, row, owned[number])) is not None:
+            kept[number], first[row["file_name"]] = fixed, number
     return kept, joined
 
 
-def _image(split: Inspection, row: Row, annotations: Sequence[Row]) -> Row | None:
-    """One image row against its file; None when it has to go."""
+def _image(split: SplitReport, row: Row, annotations: Sequence[Row]) -> Row | None:
+    """Compare one image row with its file; None when it has to be removed."""
     name = str(row["file_name"])
     path = split.files.images / name
-    file = look(path, decode=True)
+    file = read_image_file(path, decode=True)
     if file.problem:
-        split.fault(f"image-{file.problem}", name, row)
+        split.reject(f"image-{file.problem}", name, row)
         return None
     for kind, found in (
-        ("image-colour", not file.plain),
+        ("image-color", not file.is_8bit),
         ("image-huge", file.stored[0] * file.stored[1] > _HUGE),
     ):
         if found:
-            split.findings.add(kind, name)
-    split.prints[name] = _fingerprint(path)
-    sized = _sized(split, row, file, annotations)
+            split.issues.add(kind, name)
+    split.fingerprints[name] = _fingerprint(path)
+    sized = _with_file_size(split, row, file, annotations)
     if sized is not None and file.orientation > 1:
         is_turned = file.is_turned((sized["width"], sized["height"]))
-        split.findings.add("image-turned" if is_turned else "image-exif", name)
+        split.issues.add("image-turned" if is_turned else "image-exif", name)
     return sized
 
 
-def _fingerprint(path: Path) -> NDArray[np.float32]:
+def _fingerprint(path: Path) -> Float32Array:
     try:
         return fingerprint(path)
     except OSError:  # a format that only OpenCV reads
         return np.zeros(256, dtype=np.float32)
 
 
-def _sized(split: Inspection, row: Row, file: ImageFile, annotations: Sequence[Row]) -> Row | None:
+def _with_file_size(
+    split: SplitReport, row: Row, file: ImageFile, annotations: Sequence[Row]
+) -> Row | None:
     """Return the image row under a size at which the file is read; None when no size fits.
 
     A file is read upright, or as stored where that is the only size that fits.
@@ -184,55 +179,55 @@ def _sized(split: Inspection, row: Row, file: ImageFile, annotations: Sequence[R
     sizes = (file.upright, file.stored)
     if (row["width"], row["height"]) in sizes:
         return row | {"width": int(row["width"]), "height": int(row["height"])}
-    split.findings.add("image-size", str(row["file_name"]))
+    split.issues.add("image-size", str(row["file_name"]))
     for width, height in sizes:
-        if all(fits(annotation, height, width) for annotation in annotations):
+        if all(fits_image(annotation, height, width) for annotation in annotations):
             return row | {"width": width, "height": height}
     split.remove("image-size", row)
     return None
 
 
 def _annotations(
-    split: Inspection,
+    split: SplitReport,
     rows: Sequence[Row],
     images: dict[Any, Row],
     categories: set[int],
     listed: set[Any],
 ) -> list[Row]:
-    """The mended annotations. listed: ids of all images of the file, usable or not."""
+    """Return the fixed annotations. listed: ids of all images of the file, usable or not."""
     per_image: dict[Any, list[tuple[Row, dict[str, Any] | None]]] = defaultdict(list)
     for row in rows:
         image = images.get(row.get("image_id"))
         if image is None:
             if row.get("image_id") in listed:
-                split.remove("its image was left out", row)
+                split.remove("its image was removed", row)
             else:
-                split.fault("annotation-orphan", f"annotation {row.get('id')}", row)
+                split.reject("annotation-orphan", f"annotation {row.get('id')}", row)
             continue
         name = str(image["file_name"])
         if row.get("category_id") not in categories:
-            split.fault("annotation-category", name, row)
+            split.reject("annotation-category", name, row)
             continue
-        findings, mended, shape = examine(row, image["height"], image["width"])
-        for kind in findings:
-            split.findings.add(kind, name)
-        if mended is None:
-            split.remove(findings[-1], row)
+        issues, fixed, shape = check_annotation(row, image["height"], image["width"])
+        for kind in issues:
+            split.issues.add(kind, name)
+        if fixed is None:
+            split.remove(issues[-1], row)
         else:
-            per_image[image["id"]].append((mended, shape))
+            per_image[image["id"]].append((fixed, shape))
     kept = [
         row
         for number, pairs in per_image.items()
-        for row in _without_twins(split, images[number], pairs)
+        for row in _without_duplicates(split, images[number], pairs)
     ]
-    return _numbered(split, kept, images)
+    return _with_unique_ids(split, kept, images)
 
 
-def _without_twins(
-    split: Inspection, image: Row, pairs: Sequence[tuple[Row, dict[str, Any] | None]]
+def _without_duplicates(
+    split: SplitReport, image: Row, pairs: Sequence[tuple[Row, dict[str, Any] | None]]
 ) -> list[Row]:
-    """The annotations of one image without those that repeat an earlier one of their class."""
-    twins: set[int] = set()
+    """Return the annotations of an image without those that repeat one of their class."""
+    duplicates: set[int] = set()
     classes: dict[Any, list[int]] = defaultdict(list)
     for i, (row, shape) in enumerate(pairs):
         if shape is not None and not is_crowd(row):
@@ -240,20 +235,20 @@ def _without_twins(
     for members in classes.values():
         shapes = [pairs[i][1] for i in members]
         overlap = np.triu(rle.iou(shapes, shapes, [0] * len(shapes)), k=1) > _SAME_OBJECT
-        twins |= {members[j] for j in np.nonzero(overlap.any(axis=0))[0]}
-    for i in sorted(twins):
-        split.fault("annotation-twice", str(image["file_name"]), pairs[i][0])
-    return [row for i, (row, _) in enumerate(pairs) if i not in twins]
+        duplicates |= {members[j] for j in np.nonzero(overlap.any(axis=0))[0]}
+    for i in sorted(duplicates):
+        split.reject("annotation-twice", str(image["file_name"]), pairs[i][0])
+    return [row for i, (row, _) in enumerate(pairs) if i not in duplicates]
 
 
-def _numbered(split: Inspection, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
-    """The annotations with an id each."""
+def _with_unique_ids(split: SplitReport, rows: Sequence[Row], images: dict[Any, Row]) -> list[Row]:
+    """Return the annotations with an id each."""
     used: set[int] = set()
     following = max((row["id"] for row in rows if isinstance(row.get("id"), int)), default=0) + 1
     numbered = []
     for row in rows:
         if not isinstance(row.get("id"), int) or row["id"] in used:
-            split.findings.add("annotation-id", str(images[row["image_id"]]["file_name"]))
+            split.issues.add("annotation-id", str(images[row["image_id"]]["file_name"]))
             row, following = row | {"id": following}, following + 1
         used.add(row["id"])
         numbered.append(row)
@@ -261,22 +256,39 @@ def _numbered(split: Inspection, rows: Sequence[Row], images: dict[Any, Row]) ->
 
 
 def _note_objects(
-    split: Inspection, categories: Sequence[Row], images: dict[Any, Row], annotations: Sequence[Row]
+    split: SplitReport,
+    categories: Sequence[Row],
+    images: dict[Any, Row],
+    annotations: Sequence[Row],
 ) -> None:
-    """Findings about how many objects there are, per image and per class."""
+    """Add issues about the number of objects per image and per class."""
     per_image: dict[Any, int] = defaultdict(int)
     for row in annotations:
         per_image[row["image_id"]] += 1
     for number, image in images.items():
         if not per_image[number]:
-            split.findings.add("image-empty", str(image["file_name"]))
+            split.issues.add("image-empty", str(image["file_name"]))
         elif per_image[number] > _CROWDED:
-            split.findings.add("image-crowded", str(image["file_name"]))
+            split.issues.add("image-crowded", str(image["file_name"]))
     used = {row["category_id"] for row in annotations}
     for row in categories:
         if row["id"] not in used:
-            split.findings.add("category-unused", str(row["name"]))
+            split.issues.add("category-unused", str(row["name"]))
 
 
-def _whole(row: Row, *keys: str) -> bool:
+def _is_category(row: Any) -> bool:
+    """Return whether a row has a whole-number id and a name."""
+    if not isinstance(row, dict) or not isinstance(row.get("id"), int):
+        return False
+    return bool(str(row.get("name") or "").strip())
+
+
+def _is_image(row: Any) -> bool:
+    """Return whether a row has a file name, and id and size as whole numbers."""
+    if not isinstance(row, dict) or not row.get("file_name"):
+        return False
+    return _are_whole(row, "id", "width", "height")
+
+
+def _are_whole(row: Row, *keys: str) -> bool:
     return all(isinstance(row.get(key), int | float) and row[key] == int(row[key]) for key in keys)

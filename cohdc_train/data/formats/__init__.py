@@ -1,1 +1,1 @@
-"""Annotation formats that become COCO."""
+"""Read annotation formats of other tools."""

@@ -1,6 +1,4 @@
-"""What a foreign annotation format holds before it becomes COCO: images, objects, and what was left
-out (no torch).
-"""
+"""Images and objects of an annotation format before they become COCO (no torch)."""
 
 import math
 import os
@@ -10,21 +8,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as rle
 
-from cohdc_train.data.image_files import PROBLEMS, look
+from cohdc_train.data.image_files import PROBLEMS, read_image_file
 from cohdc_train.errors import DataError
+from cohdc_train.images import IMAGE_SUFFIXES
+from cohdc_train.types import Mask
 
-IMAGE_SUFFIXES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"])
-_SAGITTA = 0.05  # px by which an arc may leave the chord that stands for it
+_SAGITTA = 0.05  # px between an arc and the chord that replaces it, at most
 
 
 class SourceObject(NamedTuple):
     """One object.
 
-    name: its class. segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE. where:
-    file and row.
+    Attributes:
+        name: its class.
+        segmentation: polygons [[x, y, ...], ...] in px, or a compressed RLE.
+        where: file and row.
     """
 
     name: str
@@ -37,51 +37,52 @@ class SourceImage:
     """One image and its objects.
 
     Attributes:
-        path: its file, absolute; with `pixels`, the name it would have.
-        width, height: px, of the image that the objects are drawn on.
-        upright: that image is the file's, turned as its EXIF says.
-        pixels: gives the file's bytes where they are inside the annotation file.
-        objects: what is annotated.
+        path: its file, absolute; with `pixels`, the name that it would have.
+        width: px, of the image that the objects are drawn on.
+        height: px, likewise.
+        apply_exif: the objects are drawn on the image as its EXIF orientation turns it.
+        pixels: returns the file's bytes where they are inside the annotation file.
+        objects: annotated objects.
     """
 
     path: Path
     width: int
     height: int
-    upright: bool = False
+    apply_exif: bool = False
     pixels: Callable[[], bytes] | None = None
     objects: tuple[SourceObject, ...] = ()
 
-    def holding(self, objects: Sequence[SourceObject]) -> "SourceImage":
-        """The same image with these objects."""
+    def with_objects(self, objects: Sequence[SourceObject]) -> "SourceImage":
+        """Return the image with these objects."""
         return replace(self, objects=tuple(objects))
 
 
 @dataclass
-class Source:
-    """Everything that was read.
+class SourceDataset:
+    """Images of a source, with what was skipped and what was changed.
 
     Attributes:
         splits: "train" and "val" -> images; or only "" when the source has no split of its own.
-            While it is read also "test", until `settle_splits` leaves that out.
+            While it is read also "test", until `settle_splits` removes it.
         drawn_from: what a split is drawn from, where that is not the whole source.
         class_names: in the format's own order; None where it has none.
-        left_out: why -> where, of what is not converted.
-        notes: what -> where, of what is converted but not as it was.
+        skipped: reason -> places of what is not converted.
+        notes: what -> places of what is converted, but not as it was.
     """
 
     splits: dict[str, list[SourceImage]] = field(default_factory=dict)
     drawn_from: str = ""
     class_names: tuple[str, ...] | None = None
-    left_out: dict[str, list[str]] = field(default_factory=dict)
+    skipped: dict[str, list[str]] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
 
     def add(self, split: str, image: SourceImage) -> None:
         """Append an image to a split; "" where nothing tells its split."""
         self.splits.setdefault(split, []).append(image)
 
-    def leave_out(self, why: str, where: str) -> None:
+    def skip(self, why: str, where: str) -> None:
         """Count one thing that is not converted."""
-        self.left_out.setdefault(why, []).append(where)
+        self.skipped.setdefault(why, []).append(where)
 
     def note(self, what: str, where: str) -> None:
         """Count one thing worth knowing."""
@@ -91,11 +92,12 @@ class Source:
 def annotation_files(root: Path) -> list[Path]:
     """Return the JSON files: a file alone, or all below a folder but those in hidden folders.
 
-    Raises DataError naming the folder when it is missing or holds no JSON.
+    Raises:
+        DataError: the folder is missing or holds no JSON.
     """
     if root.is_file():
         return [root]
-    files = _below(root, {".json"})
+    files = _find_files(root, {".json"})
     if not files:
         raise DataError(
             f"{root}: {'no JSON file below it' if root.is_dir() else 'no such file or folder'}"
@@ -103,17 +105,19 @@ def annotation_files(root: Path) -> list[Path]:
     return files
 
 
-def leave_out_strays(root: Path, source: Source, why: str) -> None:
-    """Count the image files below a folder that no annotation file speaks of."""
+def skip_unlisted(root: Path, source: SourceDataset, why: str) -> None:
+    """Count the image files below a folder that no annotation file lists."""
     known = {image.path.resolve() for images in source.splits.values() for image in images}
-    for path in _below(root, IMAGE_SUFFIXES):
+    for path in _find_files(root, IMAGE_SUFFIXES):
         if path.resolve() not in known:
-            source.leave_out(why, str(path))
+            source.skip(why, str(path))
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
-    """(number, text) of the lines that are not empty. Raises DataError naming the file when it
-    cannot be read.
+    """Return (number, text) of the lines that are not empty.
+
+    Raises:
+        DataError: the file cannot be read.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -125,14 +129,19 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceImage:
-    """The image of a file, without objects. annotated: (width, height), px, where the format tells
-    it.
+    """Return the image of a file, without objects.
 
     Annotation tools show the upright image, so that is what the objects are drawn on, unless the
     annotated size is that of the stored pixels only.
-    Raises DataError naming the file when it cannot be read or is of another size.
+
+    Args:
+        path: the image file.
+        annotated: (width, height), px, where the format gives it.
+
+    Raises:
+        DataError: the file cannot be read, or has another size.
     """
-    file = look(path)
+    file = read_image_file(path)
     if file.problem:
         raise DataError(f"{path}: {PROBLEMS[file.problem]}")
     path = Path(os.path.abspath(path))
@@ -140,12 +149,15 @@ def open_image(path: Path, annotated: tuple[int, int] | None = None) -> SourceIm
     if annotated not in (None, (width, height)):
         found = f"is {width}x{height}"
         raise DataError(f"{path}: {found}, its annotation {annotated[0]}x{annotated[1]}")
-    return SourceImage(path, width, height, upright=file.is_turned(annotated))
+    return SourceImage(path, width, height, apply_exif=file.is_turned(annotated))
 
 
-def numbers(values: Any, count: int | None = None) -> list[float]:
-    """The values as finite floats. Raises TypeError or ValueError when they are not, or not `count`
-    of them.
+def parse_numbers(values: Any, count: int | None = None) -> list[float]:
+    """Return the values as finite floats.
+
+    Raises:
+        TypeError: a value is no number.
+        ValueError: a value is no finite number, or there are not `count` of them.
     """
     try:
         found = [float(value) for value in values]
@@ -157,14 +169,22 @@ def numbers(values: Any, count: int | None = None) -> list[float]:
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[float]:
-    """A polygon [x, y, ...] from two opposite corners, px."""
+    """Return a polygon [x, y, ...] from two opposite corners, px."""
     return [x0, y0, x1, y0, x1, y1, x0, y1]
 
 
 def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> list[float]:
-    """A polygon [x, y, ...] from centre and half axes, px, turned by theta, rad, from x towards y.
+    """Return a polygon [x, y, ...] of an ellipse.
 
-    Raises ValueError when a half axis is not positive.
+    Args:
+        cx: center, px.
+        cy: center, px.
+        rx: half axis along x, px.
+        ry: half axis along y, px.
+        theta: angle by which it is turned from x toward y, rad.
+
+    Raises:
+        ValueError: a half axis is not positive.
     """
     if min(rx, ry) <= 0:
         raise ValueError("half axis")
@@ -177,14 +197,13 @@ def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> l
     return flat
 
 
-def encode(mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """The compressed RLE of a mask [H, W]."""
+def encode_mask(mask: Mask) -> dict[str, Any]:
+    """Return the compressed RLE of a mask [H, W]."""
     return dict(rle.encode(np.asfortranarray(mask, dtype=np.uint8)))
 
 
-def join(parts: Sequence[Any], height: int, width: int) -> Any:
-    """One segmentation of an object's polygons [x, y, ...] and RLEs: polygons, or an RLE where
-    there is one among them.
+def join_parts(parts: Sequence[Any], height: int, width: int) -> Any:
+    """Join the parts of one object: polygons [x, y, ...], or an RLE where one is among them.
 
     height, width: px, of the image.
     """
@@ -197,9 +216,12 @@ def join(parts: Sequence[Any], height: int, width: int) -> Any:
     return rle.merge(encoded)
 
 
-def _below(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
-    """Files of these suffixes below a folder, sorted, but those whose path has a hidden part."""
+def _find_files(root: Path, suffixes: frozenset[str] | set[str]) -> list[Path]:
+    """Return files of these suffixes below a folder, sorted, without hidden ones."""
     found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
-    return sorted(
-        path for path in found if not any(p.startswith(".") for p in path.relative_to(root).parts)
-    )
+    return sorted(path for path in found if not _is_hidden(path.relative_to(root)))
+
+
+def _is_hidden(path: Path) -> bool:
+    """Return whether the file, or a folder on the way to it, is hidden."""
+    return any(part.startswith(".") for part in path.parts)

@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
-from cohdc_train.data.formats.base import Source, SourceImage
+from cohdc_train.data.formats.base import SourceDataset, SourceImage
 from cohdc_train.errors import DataError
 
 TEST = "test"
-TEST_LEFT_OUT = "image of the test split"
+TEST_SKIPPED = "image of the test split"
 _NAMES = {
     **dict.fromkeys(("train", "training"), "train"),
     **dict.fromkeys(("val", "valid", "validation"), "val"),
@@ -21,9 +21,9 @@ def split_named(name: str) -> str:
 
 
 def split_of(root: Path, *paths: Path) -> str:
-    """Return the split after which a folder below `root` on the way to one of the paths is named.
+    """Return the split that a folder on the way to one of the paths is named after; else "".
 
-    The first such folder counts. It is "" where there is none. root: a folder, or a file in it.
+    root: a folder, or a file in it; folders above it do not count.
     """
     base = Path(os.path.abspath(root if root.is_dir() else root.parent))
     for path in paths:
@@ -35,13 +35,15 @@ def split_of(root: Path, *paths: Path) -> str:
     return ""
 
 
-def settle_splits(root: Path, source: Source) -> None:
+def settle_splits(root: Path, source: SourceDataset) -> None:
     """Keep the source's own split, or gather the images that a split is drawn from.
 
-    With images of both train and val the split is the source's own, and images of neither are left
-    out. Else a split is drawn from all images that are not of test. Those of test are left out,
-    unless val has them too. All that is left out is counted.
-    Raises DataError when there are images of test only.
+    With images of both train and val the split is the source's own, and images of neither are
+    skipped. Else a split is drawn from all images that are not of test. Images of test are skipped,
+    unless val has them, too. Everything that is skipped is counted.
+
+    Raises:
+        DataError: there are images of test only.
     """
     test = {image.path for image in source.splits.pop(TEST, [])}
     val = {image.path for image in source.splits.get("val", [])}
@@ -53,10 +55,10 @@ def settle_splits(root: Path, source: Source) -> None:
         fix = "to use them, convert the folder or file named test by itself"
         raise DataError(f"{root}: all {len(test)} images are of the test split; {fix}")
     for path in sorted(test - val):
-        source.leave_out(TEST_LEFT_OUT, str(path))
+        source.skip(TEST_SKIPPED, str(path))
     if "train" in parts and "val" in parts:
         for image in parts.pop("", []):
-            source.leave_out("image of neither train, val nor test", str(image.path))
+            source.skip("image of neither train, val nor test", str(image.path))
         source.splits = {name: parts[name] for name in ("train", "val")}
         return
     source.splits = {"": [image for images in parts.values() for image in images]}

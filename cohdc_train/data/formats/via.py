@@ -1,6 +1,4 @@
-"""VGG Image Annotator: a project of version 2, or exported annotations of versions 1 and 2, as JSON
-(no torch).
-"""
+"""Read JSON of the VGG Image Annotator (VIA), versions 1 and 2 (no torch)."""
 
 import contextlib
 import os
@@ -9,20 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from cohdc_train.data.formats.base import (
-    Source,
+    SourceDataset,
     SourceImage,
     SourceObject,
     annotation_files,
     ellipse,
-    leave_out_strays,
-    numbers,
     open_image,
+    parse_numbers,
     read_lines,
     rectangle,
+    skip_unlisted,
 )
 from cohdc_train.data.formats.splits import TEST, settle_splits, split_named, split_of
 from cohdc_train.data.layout import load_json
 from cohdc_train.errors import DataError
+from cohdc_train.types import Row
 
 _NEEDS = {
     "polygon": ("all_points_x", "all_points_y"),
@@ -30,19 +29,24 @@ _NEEDS = {
     "circle": ("cx", "cy", "r"),
     "ellipse": ("cx", "cy", "rx", "ry"),
 }
-Row = dict[str, Any]
 
 
-def read_via(root: Path, attribute: str | None = None, names: Path | None = None) -> Source:
-    """A folder of images and VIA's JSON files, or one such file with its images beside it.
+def read_via(root: Path, attribute: str | None = None, names: Path | None = None) -> SourceDataset:
+    """Read a folder of images and VIA's JSON files, or one such file with its images in its folder.
 
-    attribute: the region attribute that holds the class; the only one when there is only one.
-    names: a file with one class for all regions, instead. Polylines, points and regions without
-    exactly one class are left out and counted. Folders, or JSON files, named train, val and test
-    are the source's own split. Raises DataError in one line naming the file, the image and the
-    region, or the attributes to choose from.
+    Polylines, points and regions without exactly one class are skipped and counted. Folders, or
+    JSON files, named train, val and test are the source's own split.
+
+    Args:
+        root: the folder or the file.
+        attribute: the region attribute that holds the class; needed where there are several.
+        names: a file with one class for all regions, instead.
+
+    Raises:
+        DataError: a file cannot be used; one line names the file, the image and the region, or the
+            attributes to choose from.
     """
-    source = Source()
+    source = SourceDataset()
     contents = {path: list(_entries(path)) for path in annotation_files(root)}
     split_of_file = {path: _split_of_file(root, path) for path in contents}
     learned = [content for path, content in contents.items() if split_of_file[path] != TEST]
@@ -54,9 +58,9 @@ def read_via(root: Path, attribute: str | None = None, names: Path | None = None
             image = _image(path, folder, str(entry["filename"]))
             split = split_of_file[path] or split_of(root, image.path)
             if split != TEST:
-                image = image.holding(_objects(where, _regions(entry), chosen, only, source))
+                image = image.with_objects(_objects(where, _regions(entry), chosen, only, source))
             source.add(split, image)
-    leave_out_strays(root, source, "image that no JSON lists")
+    skip_unlisted(root, source, "image that no JSON lists")
     settle_splits(root, source)
     return source
 
@@ -69,7 +73,7 @@ def _split_of_file(root: Path, path: Path) -> str:
 
 
 def _entries(path: Path) -> Iterator[tuple[str, Row]]:
-    """(the project's folder of images, entry) of every image listed in a file."""
+    """Yield (the project's folder of images, entry) of every image that a file lists."""
     content = load_json(path)
     folder = ""
     if isinstance(content, dict) and isinstance(content.get("_via_img_metadata"), dict):
@@ -90,7 +94,7 @@ def _entries(path: Path) -> Iterator[tuple[str, Row]]:
 
 
 def _regions(entry: Row) -> list[Any]:
-    """Version 1 numbers them in a mapping, version 2 lists them."""
+    """Return the regions, which version 1 numbers in a mapping and version 2 lists."""
     regions = entry["regions"]
     return list(regions.values() if isinstance(regions, dict) else regions)
 
@@ -98,20 +102,15 @@ def _regions(entry: Row) -> list[Any]:
 def _class_attribute(
     root: Path, entries: Sequence[Row], attribute: str | None, names: Path | None
 ) -> tuple[str, str | None]:
-    """The attribute that holds the class; or "" and the class of all regions."""
-    found = {
-        name
-        for entry in entries
-        for region in _regions(entry)
-        for name in region["region_attributes"]
-    }
+    """Return the attribute that holds the class; or "" and the class of all regions."""
+    regions = [region for entry in entries for region in _regions(entry)]
+    found = {name for region in regions for name in region["region_attributes"]}
     candidates = ", ".join(sorted(found))
     if names is not None and attribute is None:
         lines = [text for _, text in read_lines(names)]
         if len(lines) != 1:
-            raise DataError(
-                f"{names}: {len(lines)} classes; --names gives all regions one, --attribute each its own"
-            )
+            fix = "--names gives all regions one, --attribute each its own"
+            raise DataError(f"{names}: {len(lines)} classes; {fix}")
         return "", lines[0]
     if attribute is not None:
         if attribute not in found:
@@ -132,18 +131,20 @@ def _class_attribute(
 
 def _image(path: Path, folder: str, name: str) -> SourceImage:
     places = [path.parent / name, path.parent / folder / name]
-    file = next(
-        (place for place in places if os.path.isfile(place)), None
-    )  # False for a name too long for a file
+    # os.path.isfile is False for a name that is too long for a file
+    file = next((place for place in places if os.path.isfile(place)), None)
     if file is None:
-        raise DataError(f"{path}: image {name!r:.200} is not beside it")
+        raise DataError(f"{path}: image {name!r:.200} is not in its folder")
     return open_image(file)
 
 
 def _objects(
-    where: str, regions: Sequence[Row], attribute: str, only: str | None, source: Source
+    where: str, regions: Sequence[Row], attribute: str, only: str | None, source: SourceDataset
 ) -> list[SourceObject]:
-    """The objects of one image. only: the class of all of them, where there is no attribute."""
+    """Return the objects of one image.
+
+    only: the class of all of them, where there is no attribute.
+    """
     objects = []
     for number, region in enumerate(regions, start=1):
         here = f"{where}: region {number}"
@@ -151,9 +152,9 @@ def _objects(
         kind = str(shape.get("name"))
         names = [only] if only else _classes(region["region_attributes"].get(attribute))
         if kind not in _NEEDS:
-            source.leave_out(f"region of shape {kind!r}", here)
+            source.skip(f"region of shape {kind!r}", here)
         elif len(names) != 1:
-            source.leave_out(
+            source.skip(
                 "region of several classes" if names else f"region without {attribute!r}", here
             )
         else:
@@ -162,26 +163,28 @@ def _objects(
 
 
 def _classes(value: Any) -> list[str]:
-    """The classes that an attribute's value names: a text's one, a checkbox's checked ones."""
+    """Return the classes that an attribute's value names: one of a text, several of checkboxes."""
     if isinstance(value, dict):
         return [str(name) for name, checked in value.items() if checked]
     return [str(value).strip()] if value is not None and str(value).strip() else []
 
 
 def _outline(shape: Row, where: str) -> list[float]:
-    """A polygon [x, y, ...], px."""
+    """Return a polygon [x, y, ...], px."""
     kind = shape["name"]
     try:
         if kind == "polygon":
             points = zip(
-                numbers(shape["all_points_x"]), numbers(shape["all_points_y"]), strict=True
+                parse_numbers(shape["all_points_x"]),
+                parse_numbers(shape["all_points_y"]),
+                strict=True,
             )
             return [value for point in points for value in point]
-        values = numbers(shape[key] for key in _NEEDS[kind])
+        values = parse_numbers(shape[key] for key in _NEEDS[kind])
         if kind == "rect":
             x, y, width, height = values
             return rectangle(x, y, x + width, y + height)
         cx, cy, rx, ry = values if kind == "ellipse" else (*values, values[-1])
-        return ellipse(cx, cy, rx, ry, *numbers([shape.get("theta", 0)]))
+        return ellipse(cx, cy, rx, ry, *parse_numbers([shape.get("theta", 0)]))
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where}: {kind} needs {', '.join(_NEEDS[kind])}") from error

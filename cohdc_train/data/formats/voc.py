@@ -1,30 +1,32 @@
-"""Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them (no
-torch).
+"""Read Pascal VOC segmentation: PNGs of objects and of classes, as VOC 2012 and CVAT write them.
+
+No torch.
 """
 
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from cohdc_train.data.formats.base import (
-    IMAGE_SUFFIXES,
-    Source,
+    SourceDataset,
     SourceImage,
     SourceObject,
-    encode,
+    encode_mask,
     open_image,
     read_lines,
 )
-from cohdc_train.data.formats.splits import TEST, TEST_LEFT_OUT, split_named
+from cohdc_train.data.formats.splits import TEST, TEST_SKIPPED, split_named
 from cohdc_train.errors import DataError
+from cohdc_train.images import IMAGE_SUFFIXES
+from cohdc_train.types import Int32Array
 
 # fmt: off
 VOC_NAMES = (
-    "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow", "diningtable", "dog",
-    "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train", "tvmonitor",
+    "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow",
+    "diningtable", "dog", "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train",
+    "tvmonitor",
 )
 # fmt: on
 _BACKGROUND = frozenset(["background", "_background_"])
@@ -32,55 +34,65 @@ _IGNORED = frozenset(["ignored", "__ignore__"])
 _VOID = 255
 _NUMBERS = ("P", "L", "1")  # modes of PNGs whose pixels are numbers
 _MODES = (*_NUMBERS, "RGB", "RGBA")
-Labels = NDArray[np.int32]
 
 
 class ClassTable(NamedTuple):
-    """names: of class i + 1 at index i. colours: 0xRRGGBB -> class (0 background, 255 void).
-    painted: a file's.
+    """Classes of a source and their colors.
+
+    Attributes:
+        names: name of class i + 1 at index i.
+        colors: 0xRRGGBB -> class (0 background, 255 void).
+        painted: the colors come from a file.
     """
 
     names: tuple[str, ...]
-    colours: dict[int, int]
+    colors: dict[int, int]
     painted: bool
 
 
-def read_voc(root: Path, names: Path | None = None) -> Source:
-    """JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/ with
-    train.txt and val.txt.
+def read_voc(root: Path, names: Path | None = None) -> SourceDataset:
+    """Read JPEGImages/, SegmentationObject/, SegmentationClass/ and ImageSets/Segmentation/.
 
-    Where there is no such split, trainval.txt or CVAT's default.txt is taken. The images of
-    test.txt are left out and counted, unless val.txt has them too. names: a file with a class per
-    line, or CVAT's labelmap.txt; without it the folder's labelmap.txt, else VOC's 20. An object's
-    class is that of most class pixels under it; 255 is void and belongs to nothing. Class ids keep
-    the order of the names.
-    Raises DataError in one line naming the file and the line.
+    Where there is no train.txt and val.txt, a split is drawn from trainval.txt or CVAT's
+    default.txt. The images of test.txt are skipped and counted, unless val.txt has them, too. An
+    object's class is that of most class pixels under it; 255 is void and belongs to nothing. Class
+    ids keep the order of the names.
+
+    Args:
+        root: the folder.
+        names: a file with a class per line, or CVAT's labelmap.txt; without it the folder's
+            labelmap.txt, else VOC's 20 classes.
+
+    Raises:
+        DataError: a file cannot be used; one line names the file and the line.
     """
     table = _class_table(
         names or (root / "labelmap.txt" if (root / "labelmap.txt").is_file() else None)
     )
-    source = Source(class_names=table.names)
-    pictures = {
+    source = SourceDataset(class_names=table.names)
+    image_files = {
         path.relative_to(root / "JPEGImages").with_suffix("").as_posix(): path
         for path in sorted((root / "JPEGImages").rglob("*"))
         if path.suffix.lower() in IMAGE_SUFFIXES
     }
     lists = _lists(root)
-    tests = _leave_out_test(lists, source)
+    tests = _skip_test(lists, source)
     for split, listed in lists.items():
         source.splits[split] = []
         for number, stem in read_lines(listed):
-            if stem not in pictures:
+            if stem not in image_files:
                 raise DataError(f"{listed}:{number}: no image {stem!r} in {root / 'JPEGImages'}")
             if split == "val" or stem not in tests:
-                source.splits[split].append(_read_image(root, stem, pictures[stem], table, source))
+                source.splits[split].append(
+                    _read_image(root, stem, image_files[stem], table, source)
+                )
         if not split:
             source.drawn_from = listed.name
     return source
 
 
-def _leave_out_test(lists: dict[str, Path], source: Source) -> set[str]:
-    """Take the list of the test split away, count its images, and return their names."""
+def _skip_test(lists: dict[str, Path], source: SourceDataset) -> set[str]:
+    """Remove the list of the test split, count its images, and return their names."""
     listed = lists.pop(TEST, None)
     if listed is None:
         return set()
@@ -88,7 +100,7 @@ def _leave_out_test(lists: dict[str, Path], source: Source) -> set[str]:
     rows = read_lines(listed)
     for number, stem in rows:
         if stem not in val:
-            source.leave_out(TEST_LEFT_OUT, f"{listed}:{number}: {stem}")
+            source.skip(TEST_SKIPPED, f"{listed}:{number}: {stem}")
     return {stem for _, stem in rows}
 
 
@@ -108,10 +120,10 @@ def _lists(root: Path) -> dict[str, Path]:
 
 
 def _class_table(path: Path | None) -> ClassTable:
-    """The classes of a file with a name per line, `name` or `name:R,G,B:...`; VOC's without a file."""
+    """Return the classes of a file of lines `name` or `name:R,G,B:...`; VOC's without a file."""
     rows = [(0, name) for name in VOC_NAMES] if path is None else read_lines(path)
     names: list[str] = []
-    colours = {0x000000: 0, _voc_colour(_VOID): _VOID}
+    colors = {0x000000: 0, _voc_color(_VOID): _VOID}
     painted = False
     for number, row in rows:
         name, _, rest = (part.strip() for part in row.partition(":"))
@@ -119,36 +131,32 @@ def _class_table(path: Path | None) -> ClassTable:
             continue
         known = 0 if name in _BACKGROUND else _VOID if name in _IGNORED else len(names) + 1
         if not name or name in names:
-            raise DataError(
-                f"{path}:{number}: class {name!r} is listed twice"
-                if name
-                else f"{path}:{number}: no name"
-            )
+            fault = f"class {name!r} is listed twice" if name else "no name"
+            raise DataError(f"{path}:{number}: {fault}")
         if known == len(names) + 1:
             names.append(name)
         words = rest.partition(":")[0].split(",")
         try:
-            colour = _packed(*map(int, words)) if rest.strip(": ") else _voc_colour(known)
+            color = _packed(*map(int, words)) if rest.strip(": ") else _voc_color(known)
         except (TypeError, ValueError) as error:
             raise DataError(f"{path}:{number}: not name:R,G,B") from error
         painted |= bool(rest.strip(": "))
-        if 0 < colours.get(colour, 0) < _VOID:
-            raise DataError(
-                f"{path}:{number}: {name} has the colour of {names[colours[colour] - 1]}"
-            )
-        colours[colour] = known
+        if 0 < colors.get(color, 0) < _VOID:
+            raise DataError(f"{path}:{number}: {name} has the color of {names[colors[color] - 1]}")
+        colors[color] = known
     if not 0 < len(names) < _VOID:
         raise DataError(f"{path}: {len(names)} classes; 1 to {_VOID - 1} can be told apart")
-    return ClassTable(tuple(names), colours, painted)
+    return ClassTable(tuple(names), colors, painted)
 
 
 def _packed(red: int, green: int, blue: int) -> int:
     return red << 16 | green << 8 | blue
 
 
-def _voc_colour(index: int) -> int:
-    """VOC's colour of a class: every third bit of the index goes to red, green or blue, lowest bits
-    highest.
+def _voc_color(index: int) -> int:
+    """Return VOC's color of a class, 0xRRGGBB.
+
+    Every third bit of the index goes to red, green or blue, lowest bits highest.
     """
     channels = [0, 0, 0]
     for bit in range(8):
@@ -157,7 +165,7 @@ def _voc_colour(index: int) -> int:
 
 
 def _read_image(
-    root: Path, stem: str, picture: Path, table: ClassTable, source: Source
+    root: Path, stem: str, image_file: Path, table: ClassTable, source: SourceDataset
 ) -> SourceImage:
     files = [
         root / folder / f"{stem}.png" for folder in ("SegmentationObject", "SegmentationClass")
@@ -169,7 +177,7 @@ def _read_image(
         raise DataError(
             f"{files[1]}: {classes.shape[1]}x{classes.shape[0]}, {files[0]} {width}x{height}"
         )
-    image = open_image(picture, (width, height))
+    image = open_image(image_file, (width, height))
     found = []
     for value in np.unique(objects):
         if value in (0, void):
@@ -178,56 +186,56 @@ def _read_image(
         votes = np.bincount(classes[mask], minlength=_VOID + 1)[1:_VOID]
         where = f"{files[0]}: object {value}"
         if votes.any():
-            found.append(SourceObject(table.names[int(votes.argmax())], encode(mask), where))
+            found.append(SourceObject(table.names[int(votes.argmax())], encode_mask(mask), where))
         else:
-            source.leave_out("object without a pixel of a class under it", where)
-    return image.holding(found)
+            source.skip("object without a pixel of a class under it", where)
+    return image.with_objects(found)
 
 
-def _object_labels(path: Path) -> tuple[Labels, int]:
-    """[H, W] number of the object at each pixel, 0 none; and the number that means void."""
-    with _open(path) as picture:
-        if picture.mode in _NUMBERS:
-            return np.asarray(picture).astype(np.int32), _VOID
-        return _colours(picture), _voc_colour(_VOID)
+def _object_labels(path: Path) -> tuple[Int32Array, int]:
+    """Return the number of the object at each pixel, [H, W], 0: none; and the number of void."""
+    with _open_png(path) as image_file:
+        if image_file.mode in _NUMBERS:
+            return np.asarray(image_file).astype(np.int32), _VOID
+        return _packed_colors(image_file), _voc_color(_VOID)
 
 
-def _class_labels(path: Path, table: ClassTable) -> Labels:
-    """[H, W] class at each pixel: 1..C, 0 background, 255 void."""
-    with _open(path) as picture:
-        if picture.mode in _NUMBERS and not (picture.mode == "P" and table.painted):
-            labels = np.asarray(picture).astype(np.int32)
+def _class_labels(path: Path, table: ClassTable) -> Int32Array:
+    """Return the class at each pixel, [H, W]: 1..C, 0 background, 255 void."""
+    with _open_png(path) as image_file:
+        if image_file.mode in _NUMBERS and not (image_file.mode == "P" and table.painted):
+            labels = np.asarray(image_file).astype(np.int32)
             unknown = labels[(labels > len(table.names)) & (labels != _VOID)]
             if unknown.size:
                 raise DataError(f"{path}: class {unknown.max()} where there are {len(table.names)}")
             return labels
-        colours = _colours(picture)
-    values, place = np.unique(colours, return_inverse=True)
-    unknown = [value for value in values.tolist() if value not in table.colours]
+        colors = _packed_colors(image_file)
+    values, place = np.unique(colors, return_inverse=True)
+    unknown = [value for value in values.tolist() if value not in table.colors]
     if unknown:
         red, green, blue = int(unknown[0]).to_bytes(3, "big")
-        raise DataError(f"{path}: colour {red},{green},{blue} is no class's")
-    known = np.array([table.colours[value] for value in values.tolist()], dtype=np.int32)
-    return known[place.reshape(colours.shape)]
+        raise DataError(f"{path}: color {red},{green},{blue} is no class's")
+    known = np.array([table.colors[value] for value in values.tolist()], dtype=np.int32)
+    return known[place.reshape(colors.shape)]
 
 
-def _colours(picture: Image.Image) -> Labels:
-    """[H, W] 0xRRGGBB."""
-    rgb = np.asarray(picture.convert("RGB")).astype(np.int32)
-    packed: Labels = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
+def _packed_colors(image_file: Image.Image) -> Int32Array:
+    """Return the color at each pixel, [H, W], 0xRRGGBB."""
+    rgb = np.asarray(image_file.convert("RGB")).astype(np.int32)
+    packed: Int32Array = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
     return packed
 
 
-def _open(path: Path) -> Any:
+def _open_png(path: Path) -> Any:
     try:
-        picture = Image.open(path)
-        picture.load()
+        image_file = Image.open(path)
+        image_file.load()
     except FileNotFoundError as error:
         raise DataError(f"{path}: does not exist") from error
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as an image") from error
-    if picture.mode not in _MODES:
+    if image_file.mode not in _MODES:
         raise DataError(
-            f"{path}: a PNG of mode {picture.mode}; a palette, 8-bit grey and RGB can be read"
+            f"{path}: a PNG of mode {image_file.mode}; a palette, 8-bit gray and RGB can be read"
         )
-    return picture
+    return image_file

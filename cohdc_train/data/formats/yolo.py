@@ -1,5 +1,6 @@
-"""YOLO segmentation in Ultralytics' layout: data.yaml, images, and a text file of polygons each (no
-torch).
+"""Read YOLO segmentation in Ultralytics' layout: data.yaml, images, and text files of polygons.
+
+No torch.
 """
 
 import os
@@ -10,38 +11,40 @@ from typing import Any
 import yaml
 
 from cohdc_train.data.formats.base import (
-    IMAGE_SUFFIXES,
-    Source,
+    SourceDataset,
     SourceImage,
     SourceObject,
-    numbers,
     open_image,
+    parse_numbers,
     read_lines,
     rectangle,
 )
 from cohdc_train.errors import DataError
+from cohdc_train.images import IMAGE_SUFFIXES
+from cohdc_train.types import Row
 
 _SPLITS = ("train", "val")
-_FARTHEST = 2.0  # image sides; farther out, a coordinate is no normalised one
-Row = dict[str, Any]
+_FARTHEST = 2.0  # sides of the image; a larger coordinate is not normalized
 
 
-def read_yolo(root: Path) -> Source:
-    """A data.yaml, or the folder with it: `names`, and `train` and `val`, each a folder, a list
-    file, or several.
+def read_yolo(root: Path) -> SourceDataset:
+    """Read a data.yaml, or the folder with it.
 
-    A row `class x y x y ...` is an object; one of five numbers is a box, which becomes a rectangle
-    and is counted. Images without a label file have no objects. Class ids keep their order.
-    Raises DataError in one line naming the file and the line.
+    It has `names`, and `train` and `val`, each a folder, a list file, or several. A row `class x y
+    x y ...` is an object. A row of five numbers is a box, which becomes a rectangle and is counted.
+    Images without a label file have no objects. Class ids keep their order.
+
+    Raises:
+        DataError: a file cannot be used; one line names the file and the line.
     """
     path = _find_yaml(root)
     content = _load_yaml(path)
-    source = Source(class_names=_names(path, content.get("names")))
+    source = SourceDataset(class_names=_names(path, content.get("names")))
     for split in _SPLITS:
         images = sorted(set(_images(path, content, split)))
         source.splits[split] = [_read_image(image, source) for image in images]
     if content.get("test"):
-        source.leave_out("test split", str(path))
+        source.skip("test split", str(path))
     return source
 
 
@@ -72,7 +75,7 @@ def _load_yaml(path: Path) -> Row:
 
 
 def _names(path: Path, given: Any) -> tuple[str, ...]:
-    """Class names by index, from a list or a mapping."""
+    """Return class names by index, from a list or a mapping."""
     if isinstance(given, list):
         given = dict(enumerate(given))
     if not isinstance(given, dict) or not given or set(given) != set(range(len(given))):
@@ -84,16 +87,14 @@ def _names(path: Path, given: Any) -> tuple[str, ...]:
 
 
 def _images(path: Path, content: Row, split: str) -> Iterator[Path]:
-    """The image files of a split."""
+    """Yield the image files of a split."""
     given = content.get(split)
     if not given:
         raise DataError(f"{path}: no {split!r}")
-    roots = [
-        path.parent / str(content.get("path") or "."),
-        path.parent,
-    ]  # `path` may be another machine's
+    # `path` may belong to another machine
+    roots = [path.parent / str(content.get("path") or "."), path.parent]
     for entry in given if isinstance(given, list) else [given]:
-        # exporters write ../train/images for what lies beside the file
+        # exporters write ../train/images for what lies in the folder of the file
         names = [str(entry), str(entry).removeprefix("../")]
         place = next(
             (root / name for root in roots for name in names if os.path.exists(root / name)), None
@@ -111,7 +112,7 @@ def _images(path: Path, content: Row, split: str) -> Iterator[Path]:
 
 
 def _listed(path: Path, roots: Sequence[Path]) -> Iterator[Path]:
-    """The image files of a list file, relative to it or to the data set's root."""
+    """Yield the image files of a list file, relative to it or to the root of the data set."""
     for number, line in read_lines(path):
         found = next(
             (root / line for root in (path.parent, *roots) if os.path.isfile(root / line)), None
@@ -122,8 +123,9 @@ def _listed(path: Path, roots: Sequence[Path]) -> Iterator[Path]:
 
 
 def _label_file(image: Path) -> Path:
-    """The text file of an image: below `labels` where the image is below the last `images` of its
-    path.
+    """Return the text file of an image.
+
+    It lies below `labels` where the image lies below the last `images` of its path.
     """
     parts = list(image.parts)
     for i in range(len(parts) - 2, -1, -1):
@@ -133,36 +135,35 @@ def _label_file(image: Path) -> Path:
     return Path(*parts).with_suffix(".txt")
 
 
-def _read_image(path: Path, source: Source) -> SourceImage:
+def _read_image(path: Path, source: SourceDataset) -> SourceImage:
     image = open_image(path)
     labels = _label_file(path)
     if not labels.exists():
         source.note("image without a label file: no objects", str(path))
         return image
-    return image.holding(
+    return image.with_objects(
         [_object(f"{labels}:{number}", line, image, source) for number, line in read_lines(labels)]
     )
 
 
-def _object(where: str, line: str, image: SourceImage, source: Source) -> SourceObject:
-    """The object of one row."""
+def _object(where: str, line: str, image: SourceImage, source: SourceDataset) -> SourceObject:
+    """Return the object of one row."""
     names = source.class_names or ()
     index, *words = line.split()
     try:
-        values = numbers(words)
+        values = parse_numbers(words)
         label = int(float(index)) if float(index).is_integer() else -1
     except ValueError as error:
         raise DataError(f"{where}: not a row of numbers") from error
     if not 0 <= label < len(names):
         raise DataError(f"{where}: class {index}; names has 0 to {len(names) - 1}")
     if len(values) != 4 and (len(values) < 6 or len(values) % 2):
-        raise DataError(
-            f"{where}: {len(values)} numbers after the class; x y of three points or more, or a box of four"
-        )
+        needed = "x y of three points or more, or a box of four"
+        raise DataError(f"{where}: {len(values)} numbers after the class; {needed}")
     if max(map(abs, values)) > _FARTHEST:
-        raise DataError(
-            f"{where}: coordinate {max(values, key=abs):g}; they are shares of the image's width and height"
-        )
+        farthest = max(values, key=abs)
+        unit = "they are shares of the image's width and height"
+        raise DataError(f"{where}: coordinate {farthest:g}; {unit}")
     if len(values) == 4:
         source.note("box without a polygon, written as a rectangle", where)
         cx, cy, width, height = values

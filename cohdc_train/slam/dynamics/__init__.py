@@ -1,1 +1,1 @@
-"""Masks and moving objects."""
+"""Dynamic masks and moving objects."""

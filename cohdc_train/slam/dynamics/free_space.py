@@ -1,11 +1,9 @@
-"""Movers of any class, found by depth alone: what stands where a keyframe looked through is no part
-of the map.
+"""Moving objects of any class, found by depth: what stands in space that a keyframe saw free.
 
-The multi-view test of DynaSLAM, dense and coarse: every eighth pixel of the frame is placed in the
-world by the pose that is expected, and looked up in the depth of keyframes from other times. A
-point clearly nearer than what a keyframe saw behind it lies in space that was free then. A surface
-that stands still is never there, so two such votes are enough; depth that agrees, or that lies
-hidden behind something, says nothing.
+The multi-view test of DynaSLAM, dense on a grid of cells: each cell of the frame is placed in the
+world by the predicted pose, and compared with the depth of keyframes from other times. A point
+clearly nearer than what a keyframe measured in this direction violates free space. A static surface
+never does, so two votes suffice. Depth that agrees, or that is occluded, is no evidence of motion.
 """
 
 from dataclasses import dataclass
@@ -15,218 +13,249 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.moving_surfaces import JUMP, LEAST
+from cohdc_train.slam.config import FreeSpaceConfig, SurfaceConfig
+from cohdc_train.slam.dynamics.moving_surfaces import BoolGrid, DepthGrid
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, inverse
 
-_STEP = 8  # px of the image per coarse pixel
-_CENTRE = (_STEP - 1) / 2
-_NEARER, _NEARER_PER_M = 0.1, 0.03  # m, and m per m of depth: nearer by less is noise
-_NEAR = 0.2  # m: the sensor sees nothing nearer
-_FAR = 5.0  # m: nor anything reliable further off
-_VOTES = 2  # keyframes that must have looked through the place
-_GROWTH = 3  # coarse px a mover grows over its own surface
-_JUDGED, _MOVED = (
-    0.6,
-    0.05,
-)  # of a part at rest: readings that agree, at least, and that do not, at most
-
 _Value = TypeVar("_Value", bound=np.generic)
-DepthGrid = NDArray[np.float32]  # [h, w] m, 0 = unknown; free of distortion
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True)
-class Reference:
-    """What a keyframe saw. T_cw: [4, 4] world to camera, m; nearest: Coarse, the least depth around
-    every pixel.
+class ReferenceDepth:
+    """Depth that a keyframe has measured.
+
+    Attributes:
+        T_cw: [4, 4] world to camera, m.
+        min_depth: [h, w] m, smallest depth around each cell.
     """
 
     T_cw: Array
-    nearest: DepthGrid
+    min_depth: DepthGrid
 
 
 @dataclass(frozen=True)
 class DepthComparison:
-    """A frame's depth held against k references.
+    """Depth of a frame compared with that of k keyframes, per cell [h, w].
 
-    image: Coarse, the frame's; through: [k, h, w] bool, the reference looked through the pixel's
-    place; agrees: [k, h, w] bool, it saw a surface there.
+    Attributes:
+        depth: [h, w] m, of the frame.
+        violations: [k, h, w] bool, True = the point lies in space that the keyframe saw free.
+        consistent: [k, h, w] bool, True = the keyframe saw a surface there.
     """
 
-    image: DepthGrid
-    through: NDArray[np.bool_]
-    agrees: NDArray[np.bool_]
+    depth: DepthGrid
+    violations: NDArray[np.bool_]
+    consistent: NDArray[np.bool_]
 
-    def only(self, rows: list[int]) -> "DepthComparison":
-        """The same with some of the references."""
-        return DepthComparison(self.image, self.through[rows], self.agrees[rows])
+    def select(self, rows: list[int]) -> "DepthComparison":
+        """Return the comparison with some of the keyframes."""
+        return DepthComparison(self.depth, self.violations[rows], self.consistent[rows])
 
     @property
-    def still(self) -> NDArray[np.bool_]:
-        """[h, w] bool: a reference saw a surface there and none looked through."""
-        return np.asarray(self.agrees.any(axis=0) & ~self.through.any(axis=0))
+    def static(self) -> BoolGrid:
+        """Cells [h, w] where a keyframe saw a surface and none saw free space."""
+        return np.asarray(self.consistent.any(axis=0) & ~self.violations.any(axis=0))
 
 
 class FreeSpaceChecker:
-    """The test for one camera. Depth images and masks are as measured, lens and all."""
+    """Free-space test for the frames of one camera, with depth images and masks as measured."""
 
-    def __init__(self, camera: Camera) -> None:
-        self.camera = camera
-        self._shape = (camera.height // _STEP, camera.width // _STEP)
-        coarse = _STEP * _grid(*self._shape) + _CENTRE
-        self._rays = camera.backproject(coarse, np.ones(len(coarse))).T.astype(np.float32)
-        to_coarse = np.diag([1 / _STEP, 1 / _STEP, 1.0])
-        to_coarse[:2, 2] = -_CENTRE / _STEP
-        self._matrix = to_coarse @ camera.matrix()
-        where = np.rint(camera.distort(coarse)).astype(np.int64).T
-        self._column, self._row = (
-            np.clip(p, 0, n - 1) for p, n in zip(where, (camera.width, camera.height), strict=True)
-        )
-        self._measured = _maps((camera.distort(coarse) - _CENTRE) / _STEP, self._shape)
-        whole = (camera.height, camera.width)
-        flat = cv2.convertMaps(
-            *_maps(camera.undistort(_grid(*whole)), whole), cv2.CV_16SC2, nninterpolation=True
-        )
-        self._flat = flat[0]  # where each pixel would be without distortion, whole px
+    def __init__(
+        self,
+        camera: Camera,
+        config: FreeSpaceConfig = FreeSpaceConfig(),
+        surfaces: SurfaceConfig = SurfaceConfig(),
+    ) -> None:
+        """Prepare the grid of cells.
 
-    def nearest(self, depth: NDArray[np.float32]) -> DepthGrid:
-        """What a keyframe remembers of its depth image [H, W] m: the least around every coarse
-        pixel.
+        Args:
+            camera: of the frames; its distortion is taken into account.
+            config: grid and thresholds of the test.
+            surfaces: what makes a connected surface.
         """
-        return np.asarray(
-            cv2.erode(self._coarse(depth), np.ones((3, 3), np.uint8)), dtype=np.float32
-        )
+        self.camera = camera
+        self.config = config
+        self.surfaces = surfaces
+        cell = self.config.cell_px
+        center = (cell - 1) / 2
+        self._shape = (camera.height // cell, camera.width // cell)
+
+        centers = cell * _pixel_grid(*self._shape) + center  # undistorted px
+        self._rays = camera.backproject(centers, np.ones(len(centers))).T.astype(np.float32)
+        to_cells = np.diag([1 / cell, 1 / cell, 1.0])
+        to_cells[:2, 2] = -center / cell
+        self._matrix = to_cells @ camera.matrix()
+
+        measured = camera.distort(centers)
+        columns, rows = np.rint(measured).astype(np.int64).T
+        self._column = np.clip(columns, 0, camera.width - 1)
+        self._row = np.clip(rows, 0, camera.height - 1)
+        self._measured = _remap_arguments((measured - center) / cell, self._shape)
+
+        size = (camera.height, camera.width)
+        maps = _remap_arguments(camera.undistort(_pixel_grid(*size)), size)
+        # The undistorted place of each pixel, in whole px.
+        self._undistorted = cv2.convertMaps(*maps, cv2.CV_16SC2, nninterpolation=True)[0]
+
+    def min_depth_grid(self, depth: NDArray[np.float32]) -> DepthGrid:
+        """Return the smallest depth around each cell, which a keyframe stores. depth: [H, W] m."""
+        nearest = cv2.erode(self._cell_depth(depth), np.ones((3, 3), np.uint8))
+        return np.asarray(nearest, dtype=np.float32)
 
     def compare(
-        self, depth: NDArray[np.float32], T_cw: Array, references: list[Reference]
+        self, depth: NDArray[np.float32], T_cw: Array, references: list[ReferenceDepth]
     ) -> DepthComparison:
-        """depth: [H, W] m, 0 = none; T_cw: [4, 4] the frame's expected pose."""
-        image = self._coarse(depth)
-        rows = np.flatnonzero(image)
-        shape = (len(references), *self._shape)
-        through, agrees = (np.zeros((shape[0], image.size), dtype=np.bool_) for _ in range(2))
-        if references and len(rows):
-            seen, z = self._looked_up(
-                self._rays[:, rows] * image.ravel()[rows], inverse(T_cw), references
-            )
-            tolerance = _NEARER + _NEARER_PER_M * z
-            through[:, rows] = (seen - z > tolerance) & (z > _NEAR)
-            agrees[:, rows] = (seen > 0) & (np.abs(seen - z) <= tolerance) & (z > _NEAR)
-        return DepthComparison(image, through.reshape(shape), agrees.reshape(shape))
+        """Compare the depth of a frame with that of keyframes.
 
-    def movers(self, comparison: DepthComparison) -> NDArray[np.bool_]:
-        """Returns [h, w] bool, coarse: what two references looked through, and its surface around
-        it.
+        Args:
+            depth: [H, W] m, 0 = no reading.
+            T_cw: [4, 4] predicted pose of the frame.
+            references: depth of k keyframes.
         """
-        image, votes = comparison.image, np.count_nonzero(comparison.through, axis=0)
-        return _grown(
-            votes >= min(_VOTES, max(len(comparison.through) - 1, 1)), comparison.still, image
-        )
+        config = self.config
+        cell_depth = self._cell_depth(depth)
+        known = np.flatnonzero(cell_depth)
+        flat, shape = (len(references), cell_depth.size), (len(references), *self._shape)
+        violations, consistent = np.zeros(flat, dtype=np.bool_), np.zeros(flat, dtype=np.bool_)
+        if references and len(known):
+            points = self._rays[:, known] * cell_depth.ravel()[known]
+            measured, z = self._lookup_depth(points, inverse(T_cw), references)
+            tolerance = config.min_violation_m + config.min_violation_per_m * z
+            in_front = z > config.min_depth_m
+            close = np.abs(measured - z) <= tolerance
+            violations[:, known] = (measured - z > tolerance) & in_front
+            consistent[:, known] = (measured > 0) & close & in_front
+        return DepthComparison(cell_depth, violations.reshape(shape), consistent.reshape(shape))
 
-    def coarse(self, picture: NDArray[_Value]) -> NDArray[_Value]:
-        """picture: [H, W] as measured. Returns [h, w]: what it says in the middle of every coarse
-        pixel.
-        """
-        return np.asarray(picture[self._row, self._column]).reshape(self._shape)
+    def find_moving(self, comparison: DepthComparison) -> BoolGrid:
+        """Find the cells [h, w] that enough keyframes saw free, and their surface around them."""
+        num_references = len(comparison.violations)
+        votes = np.count_nonzero(comparison.violations, axis=0)
+        needed = min(self.config.min_votes, max(num_references - 1, 1))
+        return self._grow(votes >= needed, comparison)
 
-    def fine(self, movers: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """movers: [h, w] bool, coarse. Returns [H, W] bool, the same in the image as measured."""
-        if not movers.any():
+    def downsample(self, image: NDArray[_Value]) -> NDArray[_Value]:
+        """Take the pixel at the center of each cell. image: [H, W] as measured; returns [h, w]."""
+        return np.asarray(image[self._row, self._column]).reshape(self._shape)
+
+    def upsample(self, cells: BoolGrid) -> NDArray[np.bool_]:
+        """Draw cells [h, w] bool, with smooth outlines, into an image as measured [H, W] bool."""
+        if not cells.any():
             return np.zeros((self.camera.height, self.camera.width), dtype=np.bool_)
-        size = (_STEP * self._shape[1], _STEP * self._shape[0])
-        smooth = cv2.resize(movers.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
-        return np.asarray(cv2.remap(smooth, self._flat, np.empty(0), cv2.INTER_NEAREST) > 127)
+        height, width = self._shape
+        size = (self.config.cell_px * width, self.config.cell_px * height)
+        smooth = cv2.resize(cells.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        measured = cv2.remap(smooth, self._undistorted, np.empty(0), cv2.INTER_NEAREST)
+        return np.asarray(measured > 127)
 
     def static_components(
         self, mask: NDArray[np.bool_], comparison: DepthComparison
     ) -> NDArray[np.bool_]:
-        """The connected parts of a mask [H, W] that lie where every reference that could see them
-        saw a surface.
+        """Select the connected components of a mask where keyframes saw the same surface.
 
-        Returns [H, W] bool. Movement within the tolerance of depth, a seated person's, is not told
-        from rest.
+        Movement within the tolerance of depth, such as a seated person's, counts as static.
+
+        Args:
+            mask: [H, W] bool.
+            comparison: with keyframes old enough to tell.
+
+        Returns:
+            [H, W] bool.
         """
-        count, parts = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
-        coarse = self.coarse(parts)
-        readings, still, moved = (
-            np.bincount(coarse[chosen], minlength=count)
-            for chosen in (comparison.image > 0, comparison.still, comparison.through.any(axis=0))
-        )
-        rests = (still >= np.maximum(_JUDGED * readings, LEAST)) & (moved <= _MOVED * still)
-        rests[0] = False
-        return np.asarray(rests[parts]) if rests.any() else np.zeros_like(mask)
+        num_components, components = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
+        labels = self.downsample(components)
 
-    def _coarse(self, depth: NDArray[np.float32]) -> DepthGrid:
-        """The least reading of every block, 0 where less than half of it has one."""
-        h, w = self._shape
-        depth = depth[: h * _STEP, : w * _STEP]
-        # Read as integers, floats from 0 up keep their order; one less, and 0, no reading, becomes
-        # the largest.
-        bits = (depth.view(np.uint32) - np.uint32(1)).reshape(h, _STEP, w * _STEP).min(axis=1)
-        bits = np.ascontiguousarray(bits.reshape(h, w, _STEP).transpose(2, 0, 1)).min(axis=0)
-        least = (bits + np.uint32(1)).view(np.float32)
-        known = (depth > 0).view(np.uint8) * np.uint8(128)
-        share = cv2.resize(
-            known, (w, h), interpolation=cv2.INTER_AREA
-        )  # mean: 64 is half of a block
-        image = np.where((share >= 64) & (least < _FAR), least, 0.0).astype(np.float32)
-        return np.asarray(cv2.remap(image, *self._measured, cv2.INTER_NEAREST), dtype=np.float32)
+        def count(cells: BoolGrid) -> NDArray[np.int64]:
+            return np.bincount(labels[cells], minlength=num_components)
 
-    def _looked_up(
-        self, points: NDArray[np.float32], T_wc: Array, references: list[Reference]
+        num_known = count(comparison.depth > 0)
+        num_static = count(comparison.static)
+        num_moving = count(np.asarray(comparison.violations.any(axis=0)))
+        needed = np.maximum(self.config.min_static_ratio * num_known, self.surfaces.min_area)
+        is_static = num_static >= needed
+        is_static &= num_moving <= self.config.max_moving_ratio * num_static
+        is_static[0] = False  # the background
+        return np.asarray(is_static[components]) if is_static.any() else np.zeros_like(mask)
+
+    def _cell_depth(self, depth: NDArray[np.float32]) -> DepthGrid:
+        """Return the smallest reading of each cell, 0 where less than half of the cell has one."""
+        cell, (h, w) = self.config.cell_px, self._shape
+        depth = depth[: h * cell, : w * cell]
+        # Read as integers, floats from 0 up keep their order. Minus one, 0 (no reading) becomes the
+        # largest integer, so that the minimum ignores it.
+        bits = (depth.view(np.uint32) - np.uint32(1)).reshape(h, cell, w * cell).min(axis=1)
+        bits = np.ascontiguousarray(bits.reshape(h, w, cell).transpose(2, 0, 1)).min(axis=0)
+        nearest = (bits + np.uint32(1)).view(np.float32)
+
+        # INTER_AREA takes the mean: 64 of 128 says that half of the cell has a reading.
+        has_reading = (depth > 0).view(np.uint8) * np.uint8(128)
+        filled = cv2.resize(has_reading, (w, h), interpolation=cv2.INTER_AREA) >= 64
+        usable = filled & (nearest < self.config.max_depth_m)
+        cells = np.where(usable, nearest, 0.0).astype(np.float32)
+        return np.asarray(cv2.remap(cells, *self._measured, cv2.INTER_NEAREST), dtype=np.float32)
+
+    def _lookup_depth(
+        self, points: NDArray[np.float32], T_wc: Array, references: list[ReferenceDepth]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """points: [3, n] in the frame T_wc, m. Returns [k, n] m: the depth each reference has
-        there, and that of the points from it. float32: that is a hundredth of a coarse pixel, and
-        half the time."""
+        """Look up the depth that keyframes measured in the direction of points.
+
+        float32 errs by a hundredth of a cell and halves the time.
+
+        Args:
+            points: [3, n] m in the camera frame of T_wc.
+            T_wc: [4, 4] camera to world.
+            references: depth of k keyframes.
+
+        Returns:
+            [k, n] m measured depth, 0 = none, and [k, n] m depth of the points.
+        """
         h, w = self._shape
         T = np.stack([reference.T_cw for reference in references]) @ T_wc
-        bent = np.concatenate(
-            [self._matrix @ T[:, :3, :3], self._matrix @ T[:, :3, 3:]], axis=2
-        ).astype(np.float32)
-        local = (bent[:, :, :3].reshape(-1, 3) @ points).reshape(len(references), 3, -1) + bent[
-            :, :, 3:
-        ]
+        rotation, offset = self._matrix @ T[:, :3, :3], self._matrix @ T[:, :3, 3:]
+        projection = np.concatenate([rotation, offset], axis=2).astype(np.float32)
+        turned = projection[:, :, :3].reshape(-1, 3) @ points
+        local = turned.reshape(len(references), 3, -1) + projection[:, :, 3:]
         z = local[:, 2]
-        places = local[:, :2] / np.maximum(z, np.float32(_NEAR))[:, None] + np.float32(
-            1.5
-        )  # of the image with a rim
-        x, y = (
-            np.clip(places[:, axis], 0, size + 1).astype(np.int32)
-            for axis, size in ((0, w), (1, h))
-        )
-        rimmed = np.zeros((len(references), h + 2, w + 2), dtype=np.float32)
-        for image, reference in zip(rimmed, references, strict=True):
-            image[1:-1, 1:-1] = reference.nearest
+
+        # A border of one cell without depth takes what falls outside the image; +0.5 rounds.
+        safe_z = np.maximum(z, np.float32(self.config.min_depth_m))
+        places = local[:, :2] / safe_z[:, None] + np.float32(1.5)
+        x = np.clip(places[:, 0], 0, w + 1).astype(np.int32)
+        y = np.clip(places[:, 1], 0, h + 1).astype(np.int32)
+        padded = np.zeros((len(references), h + 2, w + 2), dtype=np.float32)
+        for image, reference in zip(padded, references, strict=True):
+            image[1:-1, 1:-1] = reference.min_depth
         first = np.arange(len(references), dtype=np.int32)[:, None] * ((h + 2) * (w + 2))
-        return rimmed.ravel().take(first + y * (w + 2) + x), z
+        return padded.ravel().take(first + y * (w + 2) + x), z
+
+    def _grow(self, found: BoolGrid, comparison: DepthComparison) -> BoolGrid:
+        """Drop specks, and grow the rest over its own surface where that is not known as static."""
+        depth = comparison.depth
+        components = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
+        _, labels, stats, _ = components
+        is_large = stats[:, cv2.CC_STAT_AREA] >= self.surfaces.min_area
+        is_large[0] = False  # the background
+        moving = is_large[labels]
+        may_move = (depth > 0) & ~comparison.static
+        for _ in range(self.config.growth_cells):
+            # Depth of the moving cell next to each cell, 0 where there is none.
+            neighbor = cv2.dilate(np.where(moving, depth, 0.0).astype(np.float32), _CROSS)
+            connected = np.abs(neighbor - depth) < self.surfaces.depth_jump_m
+            moving |= (neighbor > 0) & may_move & connected
+        return np.asarray(cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_CLOSE, _CROSS) > 0)
 
 
-def _grid(height: int, width: int) -> Array:
-    """[height * width, 2] (x, y) of an image's pixels, row by row."""
+def _pixel_grid(height: int, width: int) -> Array:
+    """Return the coordinates (x, y) of an image's pixels, row by row: [height * width, 2]."""
     y, x = np.mgrid[0:height, 0:width]
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
 
 
-def _maps(places: Array, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Places [h * w, 2] as cv2.remap takes them."""
-    x, y = places.astype(np.float32).T
+def _remap_arguments(
+    pixels: Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Convert pixels [h * w, 2] to the two maps that cv2.remap takes."""
+    x, y = pixels.astype(np.float32).T
     return x.reshape(shape), y.reshape(shape)
-
-
-def _grown(
-    found: NDArray[np.bool_], still: NDArray[np.bool_], image: DepthGrid
-) -> NDArray[np.bool_]:
-    """Specks dropped; the rest grown over its own surface, as far as that is not known to stand
-    still.
-    """
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
-    big = stats[:, cv2.CC_STAT_AREA] >= LEAST
-    big[0] = False
-    kept = big[labels]
-    for _ in range(_GROWTH):
-        beside = cv2.dilate(
-            np.where(kept, image, 0.0).astype(np.float32), _CROSS
-        )  # depth of the mover next to it
-        kept |= (beside > 0) & (image > 0) & ~still & (np.abs(beside - image) < JUMP)
-    return np.asarray(cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, _CROSS) > 0)

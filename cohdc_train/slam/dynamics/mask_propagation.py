@@ -1,14 +1,13 @@
-"""Masks carried from the frame they were made for to a later one: optical flow moves them, depth
-cuts their edge.
+"""Propagation of masks from the frame they were made for to later frames.
 
-Everything here is at half the images' width and height, where flow costs a quarter. One step, from
-a frame to the next:
+All of it runs at half the width and height, where optical flow costs a quarter. One step from a
+frame to the next:
 
-1. DIS optical flow says where every pixel of the new frame was in the old one; the mask is fetched
-   from there.
-2. Depth gate: a pixel stays in the mask if it is as deep as the pixel it came from, +-0.3 m.
-3. Cut by depth: within a narrow band about the edge, a pixel belongs to the mask if it is as deep
-   as the mask nearby, unless what lies around the mask is as deep as well: then flow alone says.
+1. DIS optical flow tells where each pixel of the new frame was in the old one; the mask is sampled
+   there.
+2. Depth gate: a pixel stays in the mask if its depth has changed by no more than 0.3 m.
+3. Depth edge: in a narrow band around the mask's edge, a pixel belongs to the mask if its depth is
+   that of the mask nearby. Where the background nearby is as deep, flow alone decides.
 """
 
 from collections import deque
@@ -19,179 +18,249 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.dynamics.masks import Mask, grow
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.config import MaskConfig
+from cohdc_train.slam.dynamics.masks import dilate_mask
+from cohdc_train.slam.frame import RGBDFrame
+from cohdc_train.types import Mask
 
 Floats = NDArray[np.float32]
 
-_GATE = 0.3  # m: what moves from one frame to the next keeps its depth
-_BAND = 2  # px of half size: how far one step may move the mask's edge to where depth breaks
-_NEARBY = 15  # px of half size: window of the mask's own depth
-_HISTORY = 45  # frames a late mask is carried through one by one; an older one takes one leap
-
 
 @dataclass(frozen=True)
-class Half:
-    """A frame at half size. gray: [h, w] uint8; depth: [h, w] m, 0 = no reading."""
+class HalfResFrame:
+    """Frame at half the width and height.
+
+    Attributes:
+        gray: [h, w] uint8.
+        depth: [h, w] m, 0 = no reading.
+    """
 
     gray: NDArray[np.uint8]
     depth: Floats
 
 
-def halve(rgb: NDArray[np.uint8], depth: Floats) -> Half:
-    """rgb: [H, W, 3]; depth: [H, W] m, of which every second reading is taken: a mean would mix
-    near and far.
+def downsample(rgb: NDArray[np.uint8], depth: Floats) -> HalfResFrame:
+    """Halve a frame; every second depth reading is taken, because a mean would mix surfaces.
+
+    Args:
+        rgb: [H, W, 3].
+        depth: [H, W] m.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    thin = np.ascontiguousarray(depth[::2, ::2])
-    size = (thin.shape[1], thin.shape[0])
-    return Half(
-        np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), thin
-    )
+    half_depth = np.ascontiguousarray(depth[::2, ::2])
+    height, width = half_depth.shape
+    half_gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
+    return HalfResFrame(np.asarray(half_gray, dtype=np.uint8), half_depth)
 
 
-def halve_mask(mask: Mask) -> Mask:
-    """[H, W] bool. Returns [h, w] bool of half size, True where half of the four pixels are."""
-    size = ((mask.shape[1] + 1) // 2, (mask.shape[0] + 1) // 2)
-    return np.asarray(
-        cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) > 127
-    )
+def downsample_mask(mask: Mask) -> Mask:
+    """Halve a mask [H, W]; a pixel of the result is True where two of four are."""
+    height, width = mask.shape
+    size = ((width + 1) // 2, (height + 1) // 2)
+    mean = cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(mean > 127)
 
 
-class Propagation:
-    """The newest mask, kept at the newest frame.
+@dataclass(frozen=True)
+class _PassedFrame:
+    """Frame that masks are propagated through. flow: [h, w, 2] px in the frame before it."""
 
-    `advance` takes every frame; `renew` takes a mask whenever one is ready, which may belong to an
-    earlier frame: it is carried through all frames since.
+    number: int
+    frame: HalfResFrame
+    flow: Floats
+
+
+class MaskPropagator:
+    """Propagator that keeps the newest mask at the newest frame.
+
+    `advance` takes each frame. `update` takes a mask when one is ready, also of an earlier frame:
+    it is propagated through all frames since.
     """
 
-    def __init__(self) -> None:
-        # Any: OpenCV's stubs do not know that the flow to start from may be None.
-        self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-        self._frames: deque[tuple[int, Half, Floats]] = deque(
-            maxlen=_HISTORY
-        )  # number, frame, places in the one before
+    def __init__(self, config: MaskConfig = MaskConfig()) -> None:
+        """Start without a mask."""
+        self._config = config
+        # Any: OpenCV's stubs do not know that the initial flow may be None.
+        self._optical_flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._frames: deque[_PassedFrame] = deque(maxlen=self._config.max_history)
         self._grid: Floats | None = None
         self._mask: Mask | None = None
         self._number = 0
 
-    def advance(self, frame: Half) -> int:
-        """Go on to the next frame, and the mask with it. Returns the frame's number, 1, 2, ..."""
-        before = self._frames[-1][1] if self._frames else frame
-        places = self._places(before, frame)
+    def advance(self, frame: HalfResFrame) -> int:
+        """Propagate the mask to the next frame. Returns the number of this frame: 1, 2, ..."""
+        before = self._frames[-1].frame if self._frames else frame
+        flow = self._flow_between(before, frame)
         self._number += 1
-        self._frames.append((self._number, frame, places))
+        self._frames.append(_PassedFrame(self._number, frame, flow))
         if self._mask is not None:
-            self._mask = carry(self._mask, before, frame, places)
+            self._mask = propagate(self._mask, before, frame, flow, self._config)
         return self._number
 
-    def renew(self, mask: Mask, number: int, frame: Half) -> None:
-        """mask: [h, w] bool of the frame that `advance` gave this number, which has passed."""
-        ahead = [entry for entry in self._frames if entry[0] > number]
-        if ahead and ahead[0][0] > number + 1:  # so old that the frames between are forgotten
-            _, newest, _ = ahead[-1]
-            ahead = [(self._number, newest, self._places(frame, newest))]
-        for _, later, places in ahead:
-            mask = carry(mask, frame, later, places)
-            frame = later
+    def update(self, mask: Mask, number: int, frame: HalfResFrame) -> None:
+        """Replace the mask by one that was made for an earlier frame.
+
+        Args:
+            mask: [h, w] bool.
+            number: of its frame, as `advance` returned it.
+            frame: its frame.
+        """
+        later = [passed for passed in self._frames if passed.number > number]
+        if later and later[0].number > number + 1:
+            # The frames in between are forgotten: one step leads to the newest.
+            newest = later[-1].frame
+            flow = self._flow_between(frame, newest)
+            later = [_PassedFrame(self._number, newest, flow)]
+        for passed in later:
+            mask = propagate(mask, frame, passed.frame, passed.flow, self._config)
+            frame = passed.frame
         self._mask = mask
 
     def mask(self) -> Mask | None:
-        """[h, w] bool at the newest frame; None before the first mask."""
+        """Return the mask [h, w] bool at the newest frame; None before the first mask."""
         return self._mask
 
-    def _places(self, old: Half, new: Half) -> Floats:
-        """[h, w, 2] px: where every pixel of the new frame was in the old one."""
+    def _flow_between(self, old: HalfResFrame, new: HalfResFrame) -> Floats:
+        """Return the place in the old frame of each pixel of the new frame: [h, w, 2] px."""
         if self._grid is None:
             rows, columns = np.indices(new.gray.shape, dtype=np.float32)
             self._grid = np.stack([columns, rows], axis=-1)
         if old is new:
             return self._grid
-        return np.asarray(self._grid + self._flow.calc(new.gray, old.gray, None), dtype=np.float32)
+        shift = self._optical_flow.calc(new.gray, old.gray, None)
+        return np.asarray(self._grid + shift, dtype=np.float32)
 
 
-def carry(mask: Mask, old: Half, new: Half, places: Floats) -> Mask:
-    """One step. mask: [h, w] at the old frame; places: [h, w, 2] px in the old frame. Returns [h,
-    w] at the new one.
+def propagate(
+    mask: Mask,
+    old: HalfResFrame,
+    new: HalfResFrame,
+    flow: Floats,
+    config: MaskConfig = MaskConfig(),
+) -> Mask:
+    """Propagate a mask by one step.
 
-    A pixel that was outside the old frame takes the value at its border: whoever was cut there
-    walks in.
+    A pixel that was outside the old frame takes the value at its border: a person who was cut off
+    there walks in.
+
+    Args:
+        mask: [h, w] bool at the old frame.
+        old: the old frame.
+        new: the new frame.
+        flow: [h, w, 2] px, place in the old frame of each pixel of the new frame.
+        config: thresholds.
+
+    Returns:
+        [h, w] bool at the new frame.
     """
     if not mask.any():
         return mask
-    columns, rows = places[..., 0], places[..., 1]
+    columns, rows = flow[..., 0], flow[..., 1]
     border = cv2.BORDER_REPLICATE
-    fetched = cv2.remap(
-        mask.astype(np.uint8) * 255, columns, rows, cv2.INTER_LINEAR, borderMode=border
-    )
-    came_from = cv2.remap(old.depth, columns, rows, cv2.INTER_NEAREST, borderMode=border)
-    jumped = (new.depth > 0) & (came_from > 0) & (np.abs(new.depth - came_from) > _GATE)
-    return cut_by_depth((fetched > 127) & ~jumped, new.depth)
+    values = mask.astype(np.uint8) * 255
+    sampled = cv2.remap(values, columns, rows, cv2.INTER_LINEAR, borderMode=border)
+    old_depth = cv2.remap(old.depth, columns, rows, cv2.INTER_NEAREST, borderMode=border)
+    both_known = (new.depth > 0) & (old_depth > 0)
+    depth_changed = both_known & (np.abs(new.depth - old_depth) > config.max_depth_change_m)
+    return snap_to_depth((sampled > 127) & ~depth_changed, new.depth, config)
 
 
-def cut_by_depth(mask: Mask, depth: Floats) -> Mask:
-    """Give the band about a mask's edge to what it is as deep as.
+def snap_to_depth(mask: Mask, depth: Floats, config: MaskConfig = MaskConfig()) -> Mask:
+    """Move the edge of a mask to the depth edge nearby.
 
-    mask: [h, w]; depth: [h, w] m, 0 = no reading. Pixels without depth, without the mask's inside
-    nearby to compare with, or where inside and outside are equally deep, as feet and the floor are,
-    stay as they are. Returns [h, w].
+    Pixels stay as they are without depth, far from the mask's interior, and where interior and
+    background are equally deep, as feet and the floor are.
+
+    Args:
+        mask: [h, w] bool.
+        depth: [h, w] m, 0 = no reading.
+        config: width of the band around the edge, and the depth tolerance.
+
+    Returns:
+        [h, w] bool.
     """
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
-    filled, has_depth = mask.astype(np.uint8), depth > 0
-    reached, core = cv2.dilate(filled, disc) > 0, cv2.erode(filled, disc) > 0
-    near_inside, as_inside = _as_deep(core & has_depth, depth)
-    _, as_outside = _as_deep(~reached & has_depth, depth)
-    decided = near_inside & has_depth & reached & ~core & ~(as_inside & as_outside)
-    return np.where(decided, as_inside, mask)
+    side = 2 * config.edge_band_px + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    values, has_depth = mask.astype(np.uint8), depth > 0
+    reached, interior = cv2.dilate(values, disc) > 0, cv2.erode(values, disc) > 0
+
+    interior_nearby, as_interior = _compare_depth(interior & has_depth, depth, config)
+    _, as_background = _compare_depth(~reached & has_depth, depth, config)
+    in_band = reached & ~interior & has_depth
+    decided = in_band & interior_nearby & ~(as_interior & as_background)
+    return np.where(decided, as_interior, mask)
 
 
-def _as_deep(part: Mask, depth: Floats) -> tuple[Mask, Mask]:
-    """Where some of a part of the image [h, w] is nearby, and where depth is its mean there, +-0.3
-    m.
+def _compare_depth(region: Mask, depth: Floats, config: MaskConfig) -> tuple[Mask, Mask]:
+    """Compare each pixel's depth with the mean depth of a region in the window around it.
+
+    Returns:
+        [h, w] bool, True = some of the region lies in the window; and [h, w] bool, True = equally
+        deep.
     """
-    size = (_NEARBY, _NEARBY)
-    weight = part.astype(np.float32)
-    share, sums = cv2.boxFilter(weight, -1, size), cv2.boxFilter(weight * depth, -1, size)
-    return share > 1e-4, np.abs(depth * share - sums) < _GATE * share
+    window = (config.window_px, config.window_px)
+    weight = region.astype(np.float32)
+    share = cv2.boxFilter(weight, -1, window)
+    sums = cv2.boxFilter(weight * depth, -1, window)
+    # Multiplied by the share instead of divided, so that an empty window needs no special case.
+    equally_deep = np.abs(depth * share - sums) < config.max_depth_change_m * share
+    return share > 1e-4, equally_deep
 
 
 @dataclass(frozen=True)
-class Job:
-    """A frame that may be segmented. number: as Propagation counts."""
+class SegmentationJob:
+    """Frame that may be segmented.
 
-    number: int
-    view: View
-    half: Half
-
-
-class CarriedMasks:
-    """The newest mask there is, carried to every frame, and grown there by what its outline asked
-    for.
-
-    newest: the frame that it was made of, None before the first.
+    Attributes:
+        number: of the frame, as `MaskPropagator.advance` counts.
+        frame: at full size.
+        half: the frame at half size.
     """
 
-    def __init__(self) -> None:
-        self.newest: Job | None = None
-        self._growth = 0.0
-        self._propagation = Propagation()
+    number: int
+    frame: RGBDFrame
+    half: HalfResFrame
 
-    def advance(self, view: View) -> Job:
-        """Go on to the next view."""
-        half = halve(view.rgb, view.depth)
-        return Job(self._propagation.advance(half), view, half)
 
-    def renew(self, job: Job, mask: Mask, growth: float) -> None:
-        """mask: [h, w] bool of half size, of a frame that has passed; growth: by how many px it is
-        to grow.
+class PropagatedMask:
+    """Newest mask of a segmenter, propagated to each frame and dilated there.
+
+    Attributes:
+        newest: the frame that the mask was made for; None before the first.
+    """
+
+    def __init__(self, config: MaskConfig = MaskConfig()) -> None:
+        """Start without a mask."""
+        self.newest: SegmentationJob | None = None
+        self._dilation_px = 0.0
+        self._propagator = MaskPropagator(config)
+
+    def advance(self, frame: RGBDFrame) -> SegmentationJob:
+        """Propagate the mask to the next frame. Returns a job to segment this frame."""
+        half = downsample(frame.rgb, frame.depth)
+        return SegmentationJob(self._propagator.advance(half), frame, half)
+
+    def update(self, job: SegmentationJob, mask: Mask, dilation_px: float) -> None:
+        """Replace the mask by that of a finished job.
+
+        Args:
+            job: of this or an earlier frame.
+            mask: [h, w] bool, half size.
+            dilation_px: dilation that is due, px at full size.
         """
-        self.newest, self._growth = job, growth
-        self._propagation.renew(mask, job.number, job.half)
+        self.newest = job
+        self._dilation_px = dilation_px
+        self._propagator.update(mask, job.number, job.half)
 
-    def mask(self, view: View) -> Mask:
-        """[H, W] bool, True = dynamic, for the view that was gone on to."""
-        mask = self._propagation.mask()
-        assert mask is not None
-        height, width = view.rgb.shape[:2]
-        grown = grow(mask, self._growth / 2).astype(np.uint8)
-        return np.asarray(cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+    def mask(self, frame: RGBDFrame) -> Mask:
+        """Return the dilated mask [H, W] bool at the newest frame; all False before the first mask.
+
+        frame: the newest frame, for its size.
+        """
+        height, width = frame.rgb.shape[:2]
+        mask = self._propagator.mask()
+        if mask is None:
+            return np.zeros((height, width), dtype=np.bool_)
+        dilated = dilate_mask(mask, self._dilation_px / 2).astype(np.uint8)
+        full = cv2.resize(dilated, (width, height), interpolation=cv2.INTER_NEAREST)
+        return np.asarray(full > 0)

@@ -1,19 +1,22 @@
-"""Groups of points that do not move with the rest, found before they drag the pose along.
+"""Clusters of map points that move against the rest, found before they bias the pose.
 
-A near thing that begins to move slowly takes the pose with it: its few points fix the camera's
-position better than a far wall's many, which a small turn reconciles, so that no single residual
-stands out. Every group is therefore judged by a pose that was found without it. What lies further
-from there than that pose's own uncertainty and the noise of measurement allow, moves. The poses of
-all groups come from sums of the same normal equations.
+A near object that begins to move slowly drags the pose along: its few points fix the camera's
+position better than the many points of a far wall, which a small rotation reconciles, so that no
+single residual stands out. Each cluster is therefore judged by a pose that was estimated without
+it. It moves if it is farther from there than the uncertainty of that pose and the measurement noise
+allow. The poses of all clusters come from sums of the same normal equations.
 
-Which of two groups that move against each other is the world, points that have long been known
-decide: a person near the camera may hold most of the points, but has only come into view.
+Of two clusters that move against each other, the one with points of long tracks is the static
+world: a person near the camera may hold most of the points, but has only come into view.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import linkage
 
+from cohdc_train.slam.config import MotionSegmentationConfig
 from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.reprojection import (
@@ -26,132 +29,196 @@ from cohdc_train.slam.optimization.reprojection import (
     residuals,
 )
 
-_PATCHES = 24  # of neighbouring points: the leaves of the tree of groups
-_LEAST = 8  # points of a group that is judged: fewer than ten near ones have carried the pose along
-_MOST = 0.6  # of all points, each as often as frames have found it: a larger group is the world
-_KNOWN = 30  # frames; a point that more have found counts no more
-_LIMIT = 16.0  # median squared distance, in standard deviations, from which a group moves
-_CLEARLY = 4.0  # times the limit: moving further counts no more than this
-_ROUNDS = 4  # groups taken out, one after the other
+
+class StaticPose(NamedTuple):
+    """Pose of a frame by the points that move together with the static world.
+
+    Attributes:
+        T_cw: [4, 4] world to camera, m.
+        inlier: [m] bool, True = the point agrees with the pose.
+        moving: [m] bool, True = the point belongs to a moving cluster.
+    """
+
+    T_cw: Array
+    inlier: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
 
 
-def pose_of_rest(
+class _PosesWithout(NamedTuple):
+    """Poses that result when one cluster is excluded.
+
+    steps: [g, 6] twist from the pose of all points; covariances: [g, 6, 6].
+    """
+
+    steps: Array
+    covariances: Array
+
+
+def estimate_static_pose(
     T_cw: Array,
     points: Array,
-    seen: Observations,
+    observed: Observations,
     reprojection: ReprojectionModel,
-    found: NDArray[np.int64],
+    track_lengths: NDArray[np.int64],
     prior: Prior | None = None,
-) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """The pose from the points that hold together, after those that move as groups were taken out.
+    config: MotionSegmentationConfig = MotionSegmentationConfig(),
+) -> StaticPose:
+    """Estimate the pose of a frame without the clusters of points that move.
 
-    T_cw: [4, 4] pose from all points; points: [m, 3] world, m; found: [m] frames that have found
-    each, 1 and more;
-    prior: where the camera was expected, which counts in poses, though not in how far a group may
-    lie off. Returns the pose, [m] bool inliers and [m] bool members of moving groups.
+    Args:
+        T_cw: [4, 4] pose by all points, m.
+        points: [m, 3] world, m.
+        observed: measurements of the points.
+        reprojection: error model.
+        track_lengths: [m] number of frames that found each point, 1 and more.
+        prior: of the pose; it has no say in which cluster moves.
+        config: thresholds.
     """
     moving = np.zeros(len(points), dtype=np.bool_)
-    T_cw, inlier = optimize_pose(T_cw, points, seen, reprojection, prior=prior)
-    for _ in range(_ROUNDS):
+    T_cw, inlier = optimize_pose(T_cw, points, observed, reprojection, prior=prior)
+    for _ in range(config.max_iterations):
         rest = np.flatnonzero(~moving)
-        group = moving_group(T_cw, points[rest], seen.take(rest), reprojection, found[rest])
-        if not group.any():
+        cluster = find_moving_cluster(
+            T_cw, points[rest], observed.take(rest), reprojection, track_lengths[rest], config
+        )
+        if not cluster.any():
             break
-        moving[rest[group]] = True
+        moving[rest[cluster]] = True
+
         rest = np.flatnonzero(~moving)
-        T_cw, agrees = optimize_pose(T_cw, points[rest], seen.take(rest), reprojection, prior=prior)
+        T_cw, agrees = optimize_pose(
+            T_cw, points[rest], observed.take(rest), reprojection, prior=prior
+        )
         inlier = np.zeros(len(points), dtype=np.bool_)
         inlier[rest[agrees]] = True
-    return T_cw, inlier, moving
+    return StaticPose(T_cw, inlier, moving)
 
 
-def moving_group(
+def find_moving_cluster(
     T_cw: Array,
     points: Array,
-    seen: Observations,
+    observed: Observations,
     reprojection: ReprojectionModel,
-    found: NDArray[np.int64],
+    track_lengths: NDArray[np.int64],
+    config: MotionSegmentationConfig = MotionSegmentationConfig(),
 ) -> NDArray[np.bool_]:
-    """The group that most clearly moves against the rest.
+    """Find the cluster of points that most clearly moves against the rest.
 
-    T_cw: [4, 4] best pose of all; points: [m, 3] world, m; found: [m] frames that have found each,
-    1 and more. Returns [m] bool, all False where everything holds together.
+    Args:
+        T_cw: [4, 4] best pose by all points, m.
+        points: [m, 3] world, m.
+        observed: measurements of the points.
+        reprojection: error model.
+        track_lengths: [m] number of frames that found each point, 1 and more.
+        config: thresholds.
+
+    Returns:
+        [m] bool, all False where nothing moves.
     """
     nothing = np.zeros(len(points), dtype=np.bool_)
-    if len(points) < 3 * _LEAST:
+    if len(points) < 3 * config.min_points:
         return nothing
     local = to_local(T_cw, points)
-    groups = nested_groups(local, np.minimum(found, _KNOWN))
-    error = residuals(local, seen, reprojection)
-    J = pose_jacobian(local, residual_jacobian(local, seen, reprojection))
-    steps, covariances = _poses_without(groups, J, error, seen.limits)
-    best, score = nothing, 0.0
-    for row in np.flatnonzero(_may_move(groups, J, error, steps)):
-        group = groups[row]
-        by_pose = J[group]
-        off = error[group] + by_pose @ steps[row]
-        spread = np.eye(3) + by_pose @ covariances[row] @ by_pose.transpose(0, 2, 1)
-        squares = np.einsum("mi,mi->m", off, np.linalg.solve(spread, off[..., None])[..., 0])
-        excess = float(np.median(squares)) / _LIMIT
-        if excess > 1 and len(off) * min(excess, _CLEARLY) > score:
-            best, score = group, len(off) * min(excess, _CLEARLY)
+    clusters = nested_clusters(local, track_lengths, config)
+    error = residuals(local, observed, reprojection)
+    jacobian = pose_jacobian(local, residual_jacobian(local, observed, reprojection))
+    poses = _poses_without(clusters, jacobian, error, observed.chi2_thresholds)
+
+    best, best_score = nothing, 0.0
+    limit = config.min_median_chi2
+    for row in np.flatnonzero(_may_move(clusters, jacobian, error, poses.steps, limit)).tolist():
+        cluster = clusters[row]
+        chi2 = _chi2_without(error[cluster], jacobian[cluster], poses, row)
+        excess = float(np.median(chi2)) / limit
+        score = len(chi2) * min(excess, config.max_excess)
+        if excess > 1 and score > best_score:
+            best, best_score = cluster, score
     return best
 
 
-def _may_move(groups: NDArray[np.bool_], J: Array, error: Array, steps: Array) -> NDArray[np.bool_]:
-    """[g] False where over half of a group lies within the limit even of a pose that is certain.
+def _chi2_without(error: Array, jacobian: Array, poses: _PosesWithout, row: int) -> Array:
+    """Return the squared errors [k], in sigmas, of a cluster's points at the pose without it.
 
-    The pose's own uncertainty only makes less of a distance, so the exact test is spared.
+    The covariance sums the noise of the measurement and the uncertainty of the pose.
     """
-    off = error[..., None] + (J.reshape(-1, 6) @ steps.T).reshape(*error.shape, -1)
-    squares = off[:, 0] ** 2 + off[:, 1] ** 2 + off[:, 2] ** 2
-    within = np.count_nonzero((squares <= _LIMIT) & groups.T, axis=0)
-    return np.asarray(2 * within <= groups.sum(axis=1))
+    residual = error + jacobian @ poses.steps[row]
+    covariance = np.eye(3) + jacobian @ poses.covariances[row] @ jacobian.transpose(0, 2, 1)
+    whitened = np.linalg.solve(covariance, residual[..., None])[..., 0]
+    return np.asarray(np.einsum("mi,mi->m", residual, whitened))
+
+
+def _may_move(
+    clusters: NDArray[np.bool_], jacobian: Array, error: Array, steps: Array, limit: float
+) -> NDArray[np.bool_]:
+    """Return False for clusters [g] that lie mostly within the limit of even an exact pose.
+
+    The uncertainty of the pose only reduces the error, so that such a cluster needs no exact test.
+    """
+    shift = (jacobian.reshape(-1, 6) @ steps.T).reshape(*error.shape, -1)
+    residual = error[..., None] + shift
+    squares = residual[:, 0] ** 2 + residual[:, 1] ** 2 + residual[:, 2] ** 2
+    num_within = np.count_nonzero((squares <= limit) & clusters.T, axis=0)
+    return np.asarray(2 * num_within <= clusters.sum(axis=1))
 
 
 def _poses_without(
-    groups: NDArray[np.bool_], J: Array, error: Array, limits: Array
-) -> tuple[Array, Array]:
-    """What each group's leaving would move the pose by, [g, 6], and the covariance of that pose,
-    [g, 6, 6].
-    """
+    clusters: NDArray[np.bool_], jacobian: Array, error: Array, limits: Array
+) -> _PosesWithout:
+    """Solve the normal equations of all points without each cluster. limits: [m] of Huber."""
     weight = huber_weights(np.einsum("mi,mi->m", error, error), limits)
-    weighted = J * weight[:, None, None]
-    H = (weighted.transpose(0, 2, 1) @ J).reshape(-1, 36)
+    weighted = jacobian * weight[:, None, None]
+    H = (weighted.transpose(0, 2, 1) @ jacobian).reshape(-1, 36)
     g = np.einsum("mra,mr->ma", weighted, error)
-    share = groups.astype(np.float64)
-    covariances = np.linalg.inv((H.sum(axis=0) - share @ H).reshape(-1, 6, 6) + 1e-6 * np.eye(6))
-    return -np.einsum("gab,gb->ga", covariances, g.sum(axis=0) - share @ g), covariances
+    members = clusters.astype(np.float64)
+    remaining_H = (H.sum(axis=0) - members @ H).reshape(-1, 6, 6)
+    remaining_g = g.sum(axis=0) - members @ g
+    covariances = np.linalg.inv(remaining_H + 1e-6 * np.eye(6))
+    return _PosesWithout(-np.einsum("gab,gb->ga", covariances, remaining_g), covariances)
 
 
-def nested_groups(local: Array, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[g, m] bool: patches of neighbouring points [m, 3] m, and their unions up a tree; those of a
-    judgeable size.
+def nested_clusters(
+    local: Array,
+    track_lengths: NDArray[np.int64],
+    config: MotionSegmentationConfig = MotionSegmentationConfig(),
+) -> NDArray[np.bool_]:
+    """Cluster points by distance: patches of neighbors, and their unions up a tree.
 
-    counts: [m] for how many each point counts when the world is sought.
+    Args:
+        local: [m, 3] points in the camera frame, m.
+        track_lengths: [m] number of frames that found each point; a cluster that holds too large a
+            share of the tracks is the static world.
+        config: sizes of clusters.
+
+    Returns:
+        [g, m] bool, the members of each cluster whose motion can be judged.
     """
-    patches, centers = _patches(local)
-    groups = list(patches)
-    if len(groups) > 1:
+    patches, centers = _patches(local, config.num_clusters)
+    clusters = list(patches)
+    if len(clusters) > 1:
         for first, second, _, _ in linkage(centers, "average"):
-            groups.append(groups[int(first)] | groups[int(second)])
-    members = np.stack(groups)
+            clusters.append(clusters[int(first)] | clusters[int(second)])
+    members = np.stack(clusters)
     size = members.sum(axis=1)
-    may_move = (members @ counts <= _MOST * counts.sum()) & (len(local) - size >= _LEAST)
-    return np.asarray(members[(size >= _LEAST) & may_move])
+
+    counts = np.minimum(track_lengths, config.max_track_length)
+    may_move = members @ counts <= config.max_ratio * counts.sum()
+    may_move &= (size >= config.min_points) & (len(local) - size >= config.min_points)
+    return np.asarray(members[may_move])
 
 
-def _patches(local: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Points by the nearest of a few that lie far apart: [p, m] bool, and the patches' middles [p,
-    3] m.
+def _patches(local: Array, num_patches: int) -> tuple[NDArray[np.bool_], Array]:
+    """Assign points to the nearest of a few seeds that lie far apart (farthest-point sampling).
+
+    Returns:
+        [p, m] bool members of each patch, and [p, 3] m centers.
     """
     x, y, z = np.ascontiguousarray(local.T)
-    middle = int(np.argmin(z))
+    seed = int(np.argmin(z))
     distance, nearest = np.full(len(local), np.inf), np.zeros(len(local), dtype=np.int64)
-    for patch in range(min(_PATCHES, len(local))):
-        square = (x - x[middle]) ** 2 + (y - y[middle]) ** 2 + (z - z[middle]) ** 2
+    for patch in range(min(num_patches, len(local))):
+        square = (x - x[seed]) ** 2 + (y - y[seed]) ** 2 + (z - z[seed]) ** 2
         nearest[square < distance] = patch
         np.minimum(distance, square, out=distance)
-        middle = int(np.argmax(distance))
+        seed = int(np.argmax(distance))
     patches = nearest[None] == np.unique(nearest)[:, None]
     return patches, (patches @ local) / patches.sum(axis=1)[:, None]

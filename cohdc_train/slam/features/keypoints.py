@@ -5,15 +5,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-SCALE = 1.2  # between two levels of the image pyramid
-LEVELS = 8
-_PRECISE = 0.3  # px at its level: standard deviation of a corner that was moved to where its point's patch fits best
-_SCALES = SCALE ** np.arange(LEVELS)  # px of level 0 per px of each level
+from cohdc_train.slam.config import FeatureConfig
+
+
+@dataclass(frozen=True)
+class ScalePyramid:
+    """Levels of the image pyramid in which keypoints are detected.
+
+    factor: size ratio of two neighboring levels; num_levels: the image itself included;
+    subpixel_sigma_px: standard deviation of a refined keypoint, px at its level.
+    """
+
+    factor: float = FeatureConfig.scale_factor
+    num_levels: int = FeatureConfig.num_levels
+    subpixel_sigma_px: float = FeatureConfig.subpixel_sigma_px
+
+    @classmethod
+    def from_config(cls, config: FeatureConfig) -> "ScalePyramid":
+        """Return the pyramid of an extractor."""
+        return cls(config.scale_factor, config.num_levels, config.subpixel_sigma_px)
+
+    def scales(self, octaves: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the px of level 0 per px of each level, of octaves [n]."""
+        return np.asarray(self.factor**octaves, dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Keypoints:
-    """Where n corners lie in an image, and what they look like; fields as those of Features."""
+    """Positions and descriptors of n keypoints; fields as in Features."""
 
     pixels: NDArray[np.float64]
     octaves: NDArray[np.int64]
@@ -21,7 +40,7 @@ class Keypoints:
     is_subpixel: NDArray[np.bool_]
 
     def take(self, rows: NDArray[np.int64]) -> "Keypoints":
-        """The chosen rows."""
+        """Return the chosen rows."""
         return Keypoints(
             self.pixels[rows], self.octaves[rows], self.descriptors[rows], self.is_subpixel[rows]
         )
@@ -29,28 +48,27 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class Features:
-    """n corners of one frame.
+    """Keypoints of one frame with undistorted positions and depth.
 
-    pixels: [n, 2] float64 as measured, px; points: [n, 2] float64 undistorted, px; octaves: [n]
-    int64 pyramid level;
-    descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where there is no reading or
-    it is not trusted;
-    precise: [n] bool, known to a fraction of a pixel, by the patch of the point that it belongs to
-    (`refinement`).
+    pixels: [n, 2] float64 as measured, px; undistorted: [n, 2] float64 px, as a pinhole camera would measure them; octaves: [n]
+    int64 pyramid level; descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where
+    there is no reading or it is refused; is_subpixel: [n] bool, refined by the patch of its point;
+    pyramid: the levels that octaves count.
     """
 
     pixels: NDArray[np.float64]
-    points: NDArray[np.float64]
+    undistorted: NDArray[np.float64]
     octaves: NDArray[np.int64]
     descriptors: NDArray[np.uint64]
     depths: NDArray[np.float64]
     is_subpixel: NDArray[np.bool_]
+    pyramid: ScalePyramid = ScalePyramid()
 
     def __post_init__(self) -> None:
         n = len(self.pixels)
         arrays = (
             self.pixels,
-            self.points,
+            self.undistorted,
             self.octaves,
             self.descriptors,
             self.depths,
@@ -64,24 +82,28 @@ class Features:
         return len(self.pixels)
 
     def keypoints(self, rows: NDArray[np.int64]) -> Keypoints:
-        """The chosen rows, without what camera and depth said of them."""
+        """Return the chosen rows, without undistorted positions and depths."""
         return Keypoints(self.pixels, self.octaves, self.descriptors, self.is_subpixel).take(rows)
+
+    def marked_subpixel(self, rows: NDArray[np.int64], is_subpixel: bool) -> "Features":
+        """Return the same keypoints, the chosen rows marked as refined or not."""
+        marks = self.is_subpixel.copy()
+        marks[rows] = is_subpixel
+        return replace(self, is_subpixel=marks)
 
     @property
     def without_subpixel(self) -> "Features":
-        """The same corners as measurements of other points than those by whose patches they are
-        precise.
-        """
+        """Return the same keypoints with none marked as refined, to measure other points."""
         return replace(self, is_subpixel=np.zeros_like(self.is_subpixel))
 
     @property
     def scales(self) -> NDArray[np.float64]:
-        """[n] px of the image per px of each corner's pyramid level."""
-        return np.asarray(SCALE**self.octaves, dtype=np.float64)
+        """Return [n] px of the image per px of each keypoint's pyramid level."""
+        return self.pyramid.scales(self.octaves)
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
-        """[n] standard deviation of a corner's position, px: it grows with the pyramid level; less
-        where precise.
+        """Return [n] standard deviations of the positions, px: one px of the level, less where
+        refined.
         """
-        return np.where(self.is_subpixel, _PRECISE, 1.0) * self.scales
+        return np.where(self.is_subpixel, self.pyramid.subpixel_sigma_px, 1.0) * self.scales

@@ -5,29 +5,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import MatchingConfig
 from cohdc_train.slam.features.descriptors import bits_of, hamming
-from cohdc_train.slam.features.keypoints import LEVELS, Features
-
-_WIDEST = (
-    2.0  # times the radius, at most: coarse corners would else be sought over a sixth of the image
-)
+from cohdc_train.slam.features.keypoints import Features
 
 
 @dataclass(frozen=True)
 class Matches:
-    """points: [m] int64 map point ids; corners: [m] int64 rows of the frame's features. Both
-    without repetition.
+    """Map points matched with keypoints of a frame, one to one.
+
+    point_ids: [m] int64 map points; keypoints: [m] int64 rows of the frame's features.
     """
 
-    points: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
     keypoints: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self.point_ids)
 
     def take(self, rows: NDArray[np.bool_]) -> "Matches":
         """The chosen rows."""
-        return Matches(self.points[rows], self.keypoints[rows])
+        return Matches(self.point_ids[rows], self.keypoints[rows])
 
 
 @dataclass(frozen=True)
@@ -47,25 +45,26 @@ class Projected:
 def match_projected(
     projected: Projected,
     features: Features,
-    radius: float,
-    max_distance: int = 90,
-    ratio: float = 0.9,
+    radius_px: float,
+    config: MatchingConfig,
+    max_hamming: int | None = None,
 ) -> Matches:
-    """Nearest descriptor among the corners near each point: within one level and `radius` px.
+    """Match each point with the nearest descriptor among the keypoints near its projection.
 
-    radius: px at level 0, growing with the corner's scale up to twofold; max_distance: bits; ratio:
-    the best must beat this share of the second best. One corner takes one point.
+    radius_px: at level 0; it grows with the keypoint's scale up to config.max_radius_scale.
+    max_hamming: bits, in place of config.max_hamming. A keypoint matches one point.
     """
+    limit = config.max_hamming if max_hamming is None else max_hamming
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    reach = radius * np.minimum(features.scales, _WIDEST)
+    reach = radius_px * np.minimum(features.scales, config.max_radius_scale)
     i, j = _neighbors(projected, features, float(reach.max()))
-    x, y = projected.pixels.T.take(i, axis=1) - features.points.T.take(j, axis=1)
+    x, y = projected.pixels.T.take(i, axis=1) - features.undistorted.T.take(j, axis=1)
     near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])
     i, j = i[near], j[near]
     bits = hamming(projected.descriptors[i], features.descriptors[j])
-    keep = bits <= max_distance
-    i, j = one_to_one(i[keep], j[keep], bits[keep], ratio)
+    keep = bits <= limit
+    i, j = one_to_one(i[keep], j[keep], bits[keep], config.ratio)
     return Matches(projected.ids[i], j)
 
 
@@ -79,14 +78,15 @@ def _neighbors(
     a point looks are then one piece of the sorted list; there are nine such pieces, of three rows
     on three levels.
     """
-    keypoint = features.points.min(axis=0) - reach
-    cells = ((features.points - keypoint) / reach).astype(
+    keypoint = features.undistorted.min(axis=0) - reach
+    cells = ((features.undistorted - keypoint) / reach).astype(
         np.int64
     )  # from 1 on: a rim of empty cells lies around
     width, height = (cells.max(axis=0) + 2).tolist()
     key = ((features.octaves + 1) * height + cells[:, 1]) * width + cells[:, 0]
     order = np.argsort(key, kind="stable")
-    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=(LEVELS + 2) * height * width))]
+    num_levels = features.pyramid.num_levels + 2
+    begins = np.r_[0, np.cumsum(np.bincount(key, minlength=num_levels * height * width))]
     places = np.floor((projected.pixels - keypoint) / reach).astype(np.int64)
     x, y = np.clip(places, 0, (width - 1, height - 1)).T
     beside = np.arange(-1, 2)[:, None]
@@ -131,10 +131,11 @@ def match_descriptors(
     ids: NDArray[np.int64],
     descriptors: NDArray[np.uint64],
     features: Features,
-    max_distance: int = 60,
+    config: MatchingConfig,
 ) -> Matches:
-    """Mutually nearest descriptors without any idea of the pose. ids: [m]; descriptors: [m, 4] of
-    the map points.
+    """Match mutually nearest descriptors without a pose.
+
+    ids: [m] map points; descriptors: [m, 4] of these points.
     """
     if len(ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -143,7 +144,7 @@ def match_descriptors(
     )  # 256 bits less twice those that differ
     nearest = alike.argmax(axis=1)
     rows = np.flatnonzero(alike.argmax(axis=0)[nearest] == np.arange(len(ids)))
-    rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * max_distance]
+    rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * config.max_hamming_unguided]
     return Matches(ids[rows], nearest[rows])
 
 

@@ -9,35 +9,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.config import MAX_KEYPOINTS
+from cohdc_train.slam.config import FeatureConfig
 from cohdc_train.slam.features.depth_sampling import sample_depth
-from cohdc_train.slam.features.keypoints import _SCALES, LEVELS, SCALE, Features, Keypoints
+from cohdc_train.slam.features.keypoints import Features, Keypoints, ScalePyramid
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import inverse, to_local
 
-_CELL = 32  # px at the level of the corner
-_POOL = 2.0  # corners detected per corner kept: what the grid chooses from
-_ENOUGH = 1.6  # the same, below which the next threshold is tried
-_THRESHOLDS = (
-    40,
-    20,
-    12,
-    7,
-)  # of FAST, grey levels: the weaker a corner may be, the longer it takes
-
 
 class OrbExtractor:
-    """Finds a budget of corners per frame. The mask is applied before the budget is spent, so a
-    crowd costs none.
-    """
+    """Extractor of up to config.max_keypoints ORB keypoints per frame, none under the mask."""
 
-    def __init__(self, camera: Camera, budget: int = MAX_KEYPOINTS) -> None:
+    def __init__(self, camera: Camera, config: FeatureConfig = FeatureConfig()) -> None:
         self.camera = camera
-        self.budget = budget
-        self._detectors = [_orb(int(budget * _POOL), threshold) for threshold in _THRESHOLDS]
+        self.config = config
+        self.pyramid = ScalePyramid.from_config(config)
+        self._detectors = [_orb(config, threshold) for threshold in config.fast_thresholds]
         self._latest = 0  # threshold that was low enough for the latest frame
-        shares = SCALE ** -np.arange(LEVELS, dtype=np.float64)
-        self._quota = np.ceil(shares / shares.sum() * budget).astype(np.int64)
+        levels = np.arange(config.num_levels)
+        self._scales = self.pyramid.scales(levels)
+        shares = config.scale_factor ** -levels.astype(np.float64)
+        self._quota = np.ceil(shares / shares.sum() * config.max_keypoints).astype(np.int64)
 
     def __call__(
         self,
@@ -59,14 +50,14 @@ class OrbExtractor:
         gray = gray_of(rgb)
         allowed = None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
         found, table = self._detect(gray, allowed)
-        chosen = spread(table, self._quota)
+        cell_px = self.config.grid_cell_px * self._scales
+        chosen = select_on_grid(table, self._quota, cell_px)
         kept, words = self._detectors[0].compute(gray, [found[i] for i in chosen])
         if words is None:
             kept, words = (), np.zeros((0, 32), dtype=np.uint8)
         pixels, octaves = _places(kept)
-        pixels += (
-            0.5 * (_SCALES[octaves] - 1.0)[:, None]
-        )  # ORB counts from the middle of a level's first pixel
+        # ORB counts from the middle of a level's first pixel.
+        pixels += 0.5 * (self._scales[octaves] - 1.0)[:, None]
         return Keypoints(
             pixels,
             octaves,
@@ -84,11 +75,17 @@ class OrbExtractor:
         """What camera and depth image say of corners; arguments as above."""
         pixels = keypoints.pixels
         points = self.camera.undistort(pixels)
-        depths = sample_depth(depth, pixels, mask)
+        depths = sample_depth(depth, pixels, self.config, mask)
         if lag is not None:
             depths = self._caught_up(depth, (pixels, points, depths), mask, lag)
         return Features(
-            pixels, points, keypoints.octaves, keypoints.descriptors, depths, keypoints.is_subpixel
+            pixels,
+            points,
+            keypoints.octaves,
+            keypoints.descriptors,
+            depths,
+            keypoints.is_subpixel,
+            self.pyramid,
         )
 
     def _caught_up(
@@ -106,31 +103,32 @@ class OrbExtractor:
         pixels, points, depths = keypoints
         there = self.camera.project(to_local(lag, self.camera.backproject(points, depths)))
         shift = np.nan_to_num(there - points)
-        moved = sample_depth(depth, pixels + shift, mask)
+        moved = sample_depth(depth, pixels + shift, self.config, mask)
         return to_local(inverse(lag), self.camera.backproject(points + shift, moved))[:, 2]
 
     def _detect(
         self, gray: NDArray[np.uint8], allowed: NDArray[np.uint8] | None
     ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float64]]:
         """Corners above the highest threshold that leaves enough, and the table of them that
-        `spread` takes.
+        `select_on_grid` takes.
 
         Which threshold was tried first, the latest frame's, makes no difference to that: ORB's own
         order, which depends on it and would decide between corners of one response, gives way to
         level, row and column.
         """
-        enough = _ENOUGH * self.budget
-        for k in range(self._latest, len(_THRESHOLDS)):
+        thresholds = self.config.fast_thresholds
+        enough = self.config.min_oversampling * self.config.max_keypoints
+        for k in range(self._latest, len(thresholds)):
             found = self._detectors[k].detect(gray, allowed)
             if len(found) >= enough:
                 break
         responses = np.fromiter(map(attrgetter("response"), found), np.float64, len(found))
-        while k > 0 and np.count_nonzero(responses >= _THRESHOLDS[k - 1]) >= enough:
+        while k > 0 and np.count_nonzero(responses >= thresholds[k - 1]) >= enough:
             k -= 1
         self._latest = k
         places, octaves = _places(found)
         order = np.lexsort((places[:, 0], places[:, 1], octaves))
-        order = order[responses[order] >= _THRESHOLDS[k]]
+        order = order[responses[order] >= thresholds[k]]
         return [found[i] for i in order], np.column_stack([places, octaves, responses])[order]
 
 
@@ -145,27 +143,28 @@ def _places(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDA
     return pixels, np.fromiter(map(attrgetter("octave"), keypoints), np.int64, len(keypoints))
 
 
-def _orb(count: int, threshold: int) -> cv2.ORB:
+def _orb(config: FeatureConfig, threshold: int) -> cv2.ORB:
     return cv2.ORB.create(
-        nfeatures=count,
-        scaleFactor=SCALE,
-        nlevels=LEVELS,
+        nfeatures=int(config.max_keypoints * config.oversampling),
+        scaleFactor=config.scale_factor,
+        nlevels=config.num_levels,
         edgeThreshold=19,
         scoreType=cv2.ORB_FAST_SCORE,
         fastThreshold=threshold,
     )
 
 
-def spread(table: NDArray[np.float64], quota: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Choose corners evenly: per pyramid level, the best of every grid cell first, then every
-    cell's second best.
+def select_on_grid(
+    table: NDArray[np.float64], quota: NDArray[np.int64], cell_px: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Select keypoints evenly: per pyramid level the best of every grid cell, then the second best.
 
-    table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level.
-    Returns rising rows.
+    table: [n, 4] rows of (x px, y px, level, response); quota: [levels] how many of each level;
+    cell_px: [levels] side of a cell, px of level 0. Returns rising rows.
     """
     best_first = np.argsort(-table[:, 3], kind="stable")
     octave = table[best_first, 2].astype(np.int64)
-    column, row = (table[best_first, :2].T // (_CELL * _SCALES)[octave]).astype(np.int64)
+    column, row = (table[best_first, :2].T // cell_px[octave]).astype(np.int64)
     cell = (octave * 10_000 + row) * 10_000 + column
     order = np.argsort(cell, kind="stable")
     rank = np.empty(len(table), dtype=np.int64)

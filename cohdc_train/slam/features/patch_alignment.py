@@ -4,30 +4,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.keypoints import SCALE
+from cohdc_train.slam.config import RefinementConfig
+from cohdc_train.slam.features.keypoints import ScalePyramid
 from cohdc_train.slam.geometry.se3 import Array
 
-PATCH_PX = 16  # px, side of a stored patch at its corner's level
-TEMPLATE_PX = 8  # px, side of the part that is compared
-MAX_LEVEL = 4  # level, beyond which a patch is so wide that it is seldom flat: points were drawn off by centimetres
-_AT_ONCE = 1024  # patches that are turned in one call
-_STEPS = 3  # what is left after them is a hundredth of a pixel
-_FURTHEST = 1.5  # px at the corner's level: what fits better further off is something else
-_DONE = 0.03  # px
-_LIKENESS = 0.8  # least normalised correlation of patch and image
-_TEXTURE = 400.0  # least eigenvalue of the patch's gradients, squared grey values
+_AT_ONCE = 1024  # patches that are warped in one call
 Floats = NDArray[np.float32]
 
 
 class Pyramid:
-    """A grey image at the finer levels of the corners."""
+    """Gray image at the finer levels of the keypoints."""
 
-    def __init__(self, gray: NDArray[np.uint8]) -> None:
-        """gray: [H, W]."""
+    def __init__(self, gray: NDArray[np.uint8], scale: ScalePyramid, max_level: int) -> None:
+        """Downsample an image [H, W] to the levels 0 to max_level of a pyramid."""
         height, width = gray.shape
         levels = [gray]
-        for level in range(1, MAX_LEVEL + 1):
-            size = (round(width / SCALE**level), round(height / SCALE**level))
+        for level in range(1, max_level + 1):
+            size = (round(width / scale.factor**level), round(height / scale.factor**level))
             smaller = cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR_EXACT)
             levels.append(np.asarray(smaller, dtype=np.uint8))
         self.levels: list[Floats] = [level.astype(np.float32) for level in levels]
@@ -42,7 +35,7 @@ class Pyramid:
         """
         result = np.empty((len(pixels), side * side), dtype=np.float32)
         height, width = self.levels[0].shape
-        shift, (right, down) = np.broadcast_to(shift, pixels.shape), square(side)
+        shift, (right, down) = np.broadcast_to(shift, pixels.shape), patch_grid(side)
         for level in np.unique(octaves).tolist():
             rows = np.flatnonzero(octaves == level)
             image = self.levels[level]
@@ -53,29 +46,36 @@ class Pyramid:
         return result
 
 
-def square(side: int) -> Floats:
+def patch_grid(side: int) -> Floats:
     """[2, side * side] offsets x and y of a square's pixels from its middle, px, row by row."""
     places = np.arange(side, dtype=np.float32) - (side - 1) / 2
     return np.stack([np.tile(places, side), np.repeat(places, side)])
 
 
-def warped(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
+def warp_patches(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
     """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image,
     at their levels.
     """
     result = np.empty((len(patches), side * side), dtype=np.float32)
+    patch_px = patches.shape[-1]
     for start in range(0, len(patches), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
-        column = patches[some].reshape(-1, PATCH_PX).astype(np.float32)  # one patch below the other
-        places = inverse[some].astype(np.float32) @ square(side) + np.float32((PATCH_PX - 1) / 2)
-        x, y = np.clip(places, 0, PATCH_PX - 1).transpose(1, 0, 2)
-        y += PATCH_PX * np.arange(len(y), dtype=np.float32)[:, None]
+        column = patches[some].reshape(-1, patch_px).astype(np.float32)  # one patch below the other
+        places = inverse[some].astype(np.float32) @ patch_grid(side) + np.float32(
+            (patch_px - 1) / 2
+        )
+        x, y = np.clip(places, 0, patch_px - 1).transpose(1, 0, 2)
+        y += patch_px * np.arange(len(y), dtype=np.float32)[:, None]
         result[some] = cv2.remap(column, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return result.reshape(-1, side, side)
 
 
 def align(
-    pyramid: Pyramid, pixels: Array, octaves: NDArray[np.int64], template: Floats
+    pyramid: Pyramid,
+    pixels: Array,
+    octaves: NDArray[np.int64],
+    template: Floats,
+    config: RefinementConfig,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Minimise eq. 8 over each pixel by inverse composition; image and patch may differ in
     brightness and contrast.
@@ -91,10 +91,10 @@ def align(
     dy = _centered(0.5 * (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]))
     gradient = np.stack([dx, dy], axis=1)  # [n, 2, k]
     H = (gradient @ gradient.transpose(0, 2, 1)).astype(np.float64) + 1e-3 * np.eye(2)
-    active = _least_eigenvalue(H) > _TEXTURE
+    active = _least_eigenvalue(H) > config.min_eigenvalue
     descent = np.linalg.inv(H).astype(np.float32) @ gradient
     shift, likeness, side = np.zeros((n, 2)), np.zeros(n), template.shape[1] - 2
-    for _ in range(_STEPS):
+    for _ in range(config.max_iterations):
         rows = np.flatnonzero(active)
         if len(rows) == 0:
             break
@@ -104,8 +104,9 @@ def align(
         likeness[rows] = np.einsum("nk,nk->n", seen, wanted) / contrast[rows, 0] ** 2
         step = (descent[rows] @ (wanted - seen)[..., None])[..., 0]
         shift[rows] += step
-        active[rows] = np.abs(step).max(axis=1) > _DONE
-    return shift, (likeness >= _LIKENESS) & (np.linalg.norm(shift, axis=1) <= _FURTHEST)
+        active[rows] = np.abs(step).max(axis=1) > config.epsilon_px
+    looks_alike = likeness >= config.min_correlation
+    return shift, looks_alike & (np.linalg.norm(shift, axis=1) <= config.max_shift_px)
 
 
 def _least_eigenvalue(H: Array) -> Array:

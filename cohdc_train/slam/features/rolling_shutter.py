@@ -17,14 +17,16 @@ def undo_rolling_shutter(features: Features, camera: Camera, twist: Array) -> Fe
     x X. Corners without depth move as if at the median depth of the others.
     """
     depths = features.depths
-    if camera.readout == 0 or np.isnan(depths).all():
+    if camera.readout_s == 0 or np.isnan(depths).all():
         return features
-    late = camera.readout * (features.pixels[:, 1] / camera.height - 0.5)  # s after the middle row
+    late = camera.readout_s * (
+        features.pixels[:, 1] / camera.height - 0.5
+    )  # s after the middle row
     known = np.where(np.isnan(depths), np.nanmedian(depths), depths)
-    local = camera.backproject(features.points, known)
+    local = camera.backproject(features.undistorted, known)
     local -= late[:, None] * (twist[:3] + np.cross(twist[3:], local))
     return replace(
         features,
-        points=camera.project(local),
+        undistorted=camera.project(local),
         depths=np.where(np.isnan(depths), np.nan, local[:, 2]),
     )

@@ -1,1 +1,1 @@
-"""Rigid motions and cameras."""
+"""Rigid motions, cameras and depth images."""

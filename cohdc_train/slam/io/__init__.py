@@ -1,1 +1,1 @@
-"""Frames in, results out."""
+"""Sources of frames, and the files of results."""

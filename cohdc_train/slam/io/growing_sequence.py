@@ -1,4 +1,4 @@
-"""A sequence that another program still writes."""
+"""Sequence that another program is still writing."""
 
 import sys
 import time
@@ -6,140 +6,180 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.live import LiveSource
-from cohdc_train.slam.io.sources import Layout
-from cohdc_train.slam.io.tum import Entry, read_entry
+from cohdc_train.slam.io.sources import SequenceFormat
+from cohdc_train.slam.io.tum import Pair, TimestampedImage, check_order, parse_line
 
 _PNG, _PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_TAIL_BYTES = 64  # read from the end of an image
+_POLL_S = 0.02  # between two looks into the folder
+_IMAGE_TIMEOUT_S = 2.0  # that a listed image may take to be written
 
 
-class Followed(LiveSource):
-    """A sequence's folder while its lists grow.
+class GrowingSequence(LiveSource):
+    """Folder of a sequence whose lists grow; a FrameSource.
 
-    Ends with a file `done` in it or after `idle` s without a new line, when every listed pair has
-    been given; at once when stopped. Pairs are chosen in the order of time, nearest first. A line
-    or image that cannot be used is told on stderr and left out, but for the first, whose DataError
-    is raised, as it is when no frame comes.
+    It ends with a file named done in the folder, or when no line has come for some time; all pairs
+    listed so far are still returned. It ends immediately when stopped. Pairs come in the order of
+    time. A line or image that cannot be used is reported on stderr and skipped.
     """
 
-    def __init__(self, folder: Path, camera: Camera, layout: Layout, idle: float) -> None:
-        super().__init__(camera)
-        if not idle > 0:
-            raise DataError(f"idle is {idle:g}; it must be above 0 s")
-        self._folder = folder
-        self._done = folder / "done"
-        self._lists = [_GrowingList(folder / name) for name in (layout.first, layout.second)]
-        self._layout = layout
-        self._idle = idle
+    def __init__(
+        self,
+        folder: Path,
+        camera: Camera,
+        sequence_format: SequenceFormat,
+        idle_timeout_s: float,
+    ) -> None:
+        """Start to follow a folder.
 
-    def __iter__(self) -> Iterator[View]:
-        given = 0
+        Args:
+            folder: of the sequence.
+            camera: intrinsics of the frames.
+            sequence_format: names of the lists, and how frames are made.
+            idle_timeout_s: time without a new line after which the sequence ends, s.
+
+        Raises:
+            DataError: the timeout is not above 0.
+        """
+        super().__init__(camera)
+        if not idle_timeout_s > 0:
+            raise DataError(f"idle_timeout is {idle_timeout_s:g}; it must be above 0 s")
+        names = (sequence_format.first, sequence_format.second)
+        self._folder = folder
+        self._end_mark = folder / "done"
+        self._lists = [_GrowingList(folder / name) for name in names]
+        self._format = sequence_format
+        self._idle_timeout_s = idle_timeout_s
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        """Return frames as they are written.
+
+        DataError is raised for the first frame when it cannot be used, and when no frame comes.
+        """
+        num_frames = 0
         for first, second in self._pairs():
             try:
-                self._await_whole(first.image, second.image)
-                view = self._layout.view(first, second)
+                self._wait_until_complete(first.path, second.path)
+                frame = self._format.make_frame(first, second)
             except DataError as error:
-                if given == 0:
+                if num_frames == 0:
                     raise
-                print(f"left out: {error}", file=sys.stderr)
+                print(f"skipped: {error}", file=sys.stderr)
                 continue
-            given += 1
-            yield view
-        if given == 0 and not self._stopped.is_set():
-            raise DataError(
-                f"{self._folder}: no frame came in {self._idle:g} s; nothing is written"
-            )
+            num_frames += 1
+            yield frame
+        if num_frames == 0 and not self._stopped.is_set():
+            waited = f"no frame came in {self._idle_timeout_s:g} s"
+            raise DataError(f"{self._folder}: {waited}; nothing is written")
 
-    def _pairs(self) -> Iterator[tuple[Entry, Entry]]:
-        """Pairs as soon as their partner is certain: when the second list has come as far as the
-        entry.
-        """
-        waiting: tuple[list[Entry], list[Entry]] = [], []
-        heard = time.monotonic()
+    def _pairs(self) -> Iterator[Pair]:
+        """Return pairs as soon as the partner is certain: the second list has come as far."""
+        waiting: tuple[list[TimestampedImage], list[TimestampedImage]] = [], []
+        last_news = time.monotonic()
         while True:
-            ended = (
-                self._done.exists()
-                or self._stopped.is_set()
-                or time.monotonic() - heard > self._idle
-            )
+            has_ended = self._has_ended(last_news)
             for queue, growing in zip(waiting, self._lists, strict=True):
-                if news := growing.news(ended):
-                    heard = time.monotonic()
+                if news := growing.read_new(has_ended):
+                    last_news = time.monotonic()
                     queue.extend(news)
             first, second = waiting
-            while first and (ended or (second and second[-1].t >= first[0].t)):
+            while first and (has_ended or _reaches(second, first[0])):
                 if self._stopped.is_set():
                     return
-                entry = first.pop(0)
-                partner = min(second, key=lambda other: abs(other.t - entry.t), default=None)
-                if partner is None or abs(partner.t - entry.t) > self._layout.max_difference:
-                    self.without_depth += 1
+                image = first.pop(0)
+                partner = self._take_partner(image, second)
+                if partner is None:
+                    self.num_unpaired += 1
                     continue
-                del second[: second.index(partner) + 1]
-                yield entry, partner
-                heard = time.monotonic()
-            if ended:
+                yield image, partner
+                last_news = time.monotonic()
+            if has_ended:
                 return
-            self._stopped.wait(_POLL)
+            self._stopped.wait(_POLL_S)
 
-    def _await_whole(self, *images: Path) -> None:
+    def _has_ended(self, last_news: float) -> bool:
+        """Check whether the sequence ends now. last_news: time of the last line, s."""
+        is_idle = time.monotonic() - last_news > self._idle_timeout_s
+        return self._end_mark.exists() or self._stopped.is_set() or is_idle
+
+    def _take_partner(
+        self, image: TimestampedImage, candidates: list[TimestampedImage]
+    ) -> TimestampedImage | None:
+        """Take the nearest candidate in time from the list, with all before it; None if too far."""
+        differences = [abs(other.timestamp - image.timestamp) for other in candidates]
+        if not differences or min(differences) > self._format.max_difference_s:
+            return None
+        index = differences.index(min(differences))
+        partner = candidates[index]
+        del candidates[: index + 1]
+        return partner
+
+    def _wait_until_complete(self, *images: Path) -> None:
+        """Wait until images are written; DataError when it takes too long."""
         start = time.monotonic()
         for image in images:
-            while not _is_whole(image):
-                if self._stopped.is_set() or time.monotonic() - start > _PATIENCE:
-                    raise DataError(
-                        f"{image}: not there, or not whole, {_PATIENCE:g} s after it was listed"
-                    )
-                time.sleep(_POLL)
+            while not _is_complete(image):
+                if self._stopped.is_set() or time.monotonic() - start > _IMAGE_TIMEOUT_S:
+                    problem = f"missing or incomplete {_IMAGE_TIMEOUT_S:g} s after it was listed"
+                    raise DataError(f"{image}: {problem}")
+                time.sleep(_POLL_S)
 
 
 class _GrowingList:
-    """The lines of a list as they come; a line counts when its end is written."""
+    """Lines of a list as they come; a line counts when its end is written."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._offset = self._number = 0
-        self._last: Entry | None = None
+        self._offset = 0  # bytes read so far
+        self._number = 0  # of the last line
+        self._last: TimestampedImage | None = None
 
-    def news(self, ended: bool) -> list[Entry]:
-        """Entries since the last call; ended: the last line needs no end."""
+    def read_new(self, has_ended: bool) -> list[TimestampedImage]:
+        """Return the images listed since the last call. has_ended: the last line needs no end."""
         try:
             with self._path.open("rb") as file:
                 file.seek(self._offset)
                 text = file.read()
         except FileNotFoundError:
             return []
-        if not ended:
+        if not has_ended:
             text = text[: text.rfind(b"\n") + 1]
         self._offset += len(text)
-        return [entry for line in text.splitlines() if (entry := self._entry(line)) is not None]
+        images = [self._parse(line) for line in text.splitlines()]
+        return [image for image in images if image is not None]
 
-    def _entry(self, line: bytes) -> Entry | None:
+    def _parse(self, line: bytes) -> TimestampedImage | None:
+        """Parse the next line; DataError for the first one, None for a later one that is broken."""
         self._number += 1
         try:
-            entry = read_entry(self._path, self._number, line.decode("utf-8", "replace"))
-            if entry is not None and self._last is not None and entry.t <= self._last.t:
-                message = f"time stamp {entry.stamp} does not come after {self._last.stamp}"
-                raise DataError(f"{self._path}:{self._number}: {message}")
+            image = parse_line(self._path, self._number, line.decode("utf-8", "replace"))
+            if image is not None:
+                check_order(self._path, self._number, image, self._last)
         except DataError as error:
             if self._last is None:
                 raise
-            print(f"left out: {error}", file=sys.stderr)
+            print(f"skipped: {error}", file=sys.stderr)
             return None
-        self._last = entry or self._last
-        return entry
+        self._last = image or self._last
+        return image
 
 
-def _is_whole(image: Path) -> bool:
-    """Whether a PNG or JPEG ends as one does; other kinds are whole when they hold anything."""
+def _reaches(images: list[TimestampedImage], image: TimestampedImage) -> bool:
+    """Check that a list has come as far in time as an image."""
+    return bool(images) and images[-1].timestamp >= image.timestamp
+
+
+def _is_complete(image: Path) -> bool:
+    """Check that a PNG or JPEG file has its end; other files are complete with 4 bytes."""
     try:
         with image.open("rb") as file:
             head = file.read(4)
             size = file.seek(0, 2)
-            file.seek(max(size - 64, 0))
+            file.seek(max(size - _TAIL_BYTES, 0))
             tail = file.read().rstrip(b"\0")
     except OSError:
         return False
@@ -148,7 +188,3 @@ def _is_whole(image: Path) -> bool:
     if head.startswith(_JPEG):
         return tail.endswith(_JPEG_END)
     return size >= 4
-
-
-_POLL = 0.02  # s between two looks into the folder
-_PATIENCE = 2.0  # s a listed image may still be on its way to the disk

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectory, metrics, a row per frame, the resolved config, pictures."""
+"""Result files of a run: trajectory, metrics, one row per frame, and the resolved options."""
 
 import csv
 import json
@@ -8,58 +8,83 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from cohdc_train.errors import DataError
 from cohdc_train.files import check_folder, publish
 from cohdc_train.slam.frame import FrameRecord
 from cohdc_train.trajectory.evaluate import score
-from cohdc_train.trajectory.trajectory import Trajectory, write_tum
+from cohdc_train.trajectory.trajectory import Trajectory
 
 _VERB = "slam"
-_NAMES = (
-    *("trajectory.txt", "metrics.json", "frames.csv", "config.yaml"),
-    *("map.ply", "map.png", "pictures"),
+_TEXT_FILES = ("trajectory.txt", "metrics.json", "frames.csv", "config.yaml")
+_NAMES = (*_TEXT_FILES, "map.ply", "map.png", "pictures")
+_DENSE_CLOUD = "cloud.ply"
+_MIN_SCORED_FRAMES = 3  # fewer poses fix no rigid alignment
+_COLUMNS = (
+    *("stamp", "tracked", "keyframe", "matches", "inliers", "culled_share"),
+    *("segment_ms", "track_ms", "map_ms"),
 )
 
 
-def measure(
+def compute_metrics(
     records: list[FrameRecord], trajectory: Trajectory, truth: Trajectory | None, dropped: int = 0
 ) -> dict[str, Any]:
-    """The numbers of metrics.json but the seed.
+    """Compute the numbers of metrics.json.
 
-    dropped: frames that came while the tracker was busy and have no record; they count as frames
-    without a pose. `coverage` is tracked / associated frames; `ms` has p50 and p95 per stage, `map`
-    over keyframes only, `depth` of stereo pairs only; `fps` is frames over the time of all stages.
-    Errors are absent without a truth, and, which is told on stderr, where it is of another time.
+    `coverage` is tracked over associated frames. `ms` has p50 and p95 of each stage: `map` is of
+    one keyframe, with the work for it on later frames, `depth` of stereo pairs only, `segment` is
+    each frame's wait for its mask. `fps` is frames over the time of all stages.
+
+    Args:
+        records: of the frames that reached the tracker.
+        trajectory: final, of the tracked frames.
+        truth: true trajectory. Where it covers another time, stderr says so, and errors are absent
+            as they are without it.
+        dropped: frames that came while the tracker was busy; they count as not tracked.
     """
-    poses = [record.pose for record in records]
-    depth = [record.depth_ms for record in records]
-    times = ({"depth": depth} if any(depth) else {}) | {
-        "segment": [record.segment_ms for record in records],
-        "track": [pose.track_ms for pose in poses],
-        "map": [pose.map_ms for pose in poses if pose.keyframe],
-    }
-    tracked = sum(pose.tracked for pose in poses)
-    busy = sum(sum(row) for row in times.values())
-    result: dict[str, Any] = {
-        "frames": len(poses) + dropped,
-        "tracked": tracked,
-        "coverage": tracked / (len(poses) + dropped),
-        "keyframes": sum(pose.keyframe for pose in poses),
-        "fps": 1e3 * len(poses) / busy,
+    times = _stage_times(records)
+    num_tracked = sum(record.is_tracked for record in records)
+    total_ms = sum(sum(row) for row in times.values())
+    num_frames = len(records) + dropped
+    metrics: dict[str, Any] = {
+        "frames": num_frames,
+        "tracked": num_tracked,
+        "coverage": num_tracked / num_frames,
+        "keyframes": sum(record.is_keyframe for record in records),
+        "fps": 1e3 * len(records) / total_ms,
         "ms": {stage: quantiles(row) for stage, row in times.items()},
     }
-    if truth is not None and tracked >= 3:
+    if truth is not None and num_tracked >= _MIN_SCORED_FRAMES:
         try:
-            result.update(score(truth, trajectory))
+            metrics.update(score(truth, trajectory))
         except DataError as error:
             print(f"no scores: {error}", file=sys.stderr)
-    return result
+    return metrics
+
+
+def _stage_times(records: list[FrameRecord]) -> dict[str, list[float]]:
+    """Return the times of each stage, ms."""
+    timings = [record.timing for record in records]
+    depth = [timing.depth_ms for timing in timings]
+    times = {"depth": depth} if any(depth) else {}
+    times["segment"] = [timing.mask_ms for timing in timings]
+    times["track"] = [timing.tracking_ms for timing in timings]
+    times["map"] = _mapping_times(records)
+    return times
+
+
+def _mapping_times(records: list[FrameRecord]) -> list[float]:
+    """Return the time of mapping per keyframe, ms, with the work that later frames did for it."""
+    times: list[float] = []
+    for record in records:
+        if record.is_keyframe or not times:
+            times.append(0.0)
+        times[-1] += record.timing.mapping_ms
+    return times
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """p50 and p95; 0 where there is no value."""
+    """Return p50 and p95 of some values; 0 where there are none."""
     array = np.array(values or [0.0])
     return {"p50": float(np.quantile(array, 0.5)), "p95": float(np.quantile(array, 0.95))}
 
@@ -69,50 +94,54 @@ def write_run(
     records: list[FrameRecord],
     trajectory: Trajectory,
     metrics: dict[str, Any],
-    config: dict[str, Any],
+    config: str,
 ) -> None:
     """Write trajectory.txt, metrics.json, frames.csv and config.yaml into an existing folder."""
-    write_tum(folder / "trajectory.txt", trajectory)
+    trajectory.save_tum(folder / "trajectory.txt")
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+    (folder / "config.yaml").write_text(config, encoding="utf-8")
     with (folder / "frames.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(
-            [
-                "stamp",
-                "tracked",
-                "keyframe",
-                "inliers",
-                "culled_share",
-                "segment_ms",
-                "track_ms",
-                "map_ms",
-            ]
-        )
-        for record in records:
-            pose = record.pose
-            times = [f"{ms:.2f}" for ms in (record.segment_ms, pose.track_ms, pose.map_ms)]
-            culled = f"{record.culled:.4f}"
-            writer.writerow(
-                [record.stamp, int(pose.tracked), int(pose.keyframe), pose.inliers, culled, *times]
-            )
+        writer.writerow(_COLUMNS)
+        writer.writerows(_row(record) for record in records)
 
 
-def publish_run(part: Path, out: Path) -> None:
-    """Move the files of a run into `out`, in place of those of a former one.
+def _row(record: FrameRecord) -> list[object]:
+    """Return the row of a frame in frames.csv."""
+    timing = record.timing
+    times = (timing.mask_ms, timing.tracking_ms, timing.mapping_ms)
+    return [
+        record.timestamp_text,
+        int(record.is_tracked),
+        int(record.is_keyframe),
+        record.num_matches,
+        record.num_inliers,
+        f"{record.masked_ratio:.4f}",
+        *(f"{ms:.2f}" for ms in times),
+    ]
 
-    A file that somebody else put there during the run stays, and is named on stderr.
+
+def move_into_place(part: Path, out: Path) -> None:
+    """Move the files of a run into the output folder, in place of those of a former run.
+
+    A file that someone else put there during the run stays, and stderr names it.
     """
     for name in publish(part, out, _VERB):
-        print(f"{out / name}: is not of a run and was kept; this run's is lost", file=sys.stderr)
+        problem = "was written by another program during the run, and is kept"
+        print(f"{out / name}: {problem}; the file of this run is lost", file=sys.stderr)
 
 
-def check_out(out: Path, cloud: bool) -> None:
-    """Raise DataError when `out` cannot become a folder of results. Makes the folder above it.
+def check_output_dir(out: Path, is_dense: bool) -> None:
+    """Check that a folder can take the results of a run, and create the folder above it.
 
-    cloud: whether the run writes cloud.ply.
+    Args:
+        out: the folder.
+        is_dense: the run writes cloud.ply as well.
+
+    Raises:
+        DataError: the folder cannot be written, or holds files of others with these names.
     """
-    check_folder(out, _VERB, [*_NAMES, "cloud.ply"] if cloud else _NAMES)
+    check_folder(out, _VERB, [*_NAMES, _DENSE_CLOUD] if is_dense else _NAMES)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for folder in (out.parent, out):

@@ -1,6 +1,4 @@
-"""A sequence folder in the layout of the TUM RGB-D benchmark: rgb.txt and depth.txt, paired by
-nearest time stamp.
-"""
+"""Lists and images of the TUM RGB-D benchmark's format."""
 
 import math
 from dataclasses import dataclass
@@ -17,78 +15,59 @@ from cohdc_train.trajectory.association import associate
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One associated pair; `t` and `stamp` are the colour image's, s; `depth_stamp` is the depth
-    image's own.
+class TimestampedImage:
+    """Line of a list such as rgb.txt.
+
+    Attributes:
+        timestamp: s.
+        timestamp_text: as the line writes it.
+        path: of the image.
     """
 
-    t: float
-    stamp: str
-    depth_stamp: str
-    rgb: Path
-    depth: Path
+    timestamp: float
+    timestamp_text: str
+    path: Path
 
 
-@dataclass(frozen=True)
-class Sequence:
-    """frames in the order of time; `without_depth`: how many colour images found no depth image
-    near enough.
-    """
-
-    folder: Path
-    frames: tuple[Frame, ...]
-    without_depth: int
-
-    @property
-    def groundtruth(self) -> Path | None:
-        """groundtruth.txt when the folder has one."""
-        path = self.folder / "groundtruth.txt"
-        return path if path.is_file() else None
+Pair = tuple[TimestampedImage, TimestampedImage]
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A line of a list. t: s; stamp: t as the line writes it; image: the file it names."""
+def read_pairs(first: Path, second: Path, max_difference_s: float) -> tuple[list[Pair], int]:
+    """Read two lists and pair their images, one to one, nearest timestamps first.
 
-    t: float
-    stamp: str
-    image: Path
+    TUM's associate tool does the same.
 
+    Args:
+        first: list such as rgb.txt.
+        second: list such as depth.txt.
+        max_difference_s: largest time between the images of a pair, s.
 
-def read_sequence(folder: Path, max_difference: float = 0.02) -> Sequence:
-    """Read the two lists and pair them one to one, nearest stamps first, as TUM's associate tool
-    does.
+    Returns:
+        Pairs in the order of time, and how many images of the first list have no partner.
 
-    max_difference: s. Raises DataError naming file and line for a missing or broken list, stamps
-    that do not rise, an image that is not there, or when nothing pairs.
-    """
-    pairs, alone = read_pairs(folder / "rgb.txt", folder / "depth.txt", max_difference)
-    frames = tuple(
-        Frame(rgb.t, rgb.stamp, depth.stamp, rgb.image, depth.image) for rgb, depth in pairs
-    )
-    return Sequence(folder, frames, alone)
-
-
-def read_pairs(
-    first: Path, second: Path, max_difference: float
-) -> tuple[list[tuple[Entry, Entry]], int]:
-    """Two lists paired as read_sequence does, and how many of the first stay alone. Raises
-    DataError as it does.
+    Raises:
+        DataError: a list or image is missing or broken, timestamps do not rise, or nothing pairs;
+            the message names file and line.
     """
     ours, theirs = _read_list(first), _read_list(second)
-    times = np.array([entry.t for entry in ours]), np.array([entry.t for entry in theirs])
-    pairs = [(ours[i], theirs[j]) for i, j in associate(*times, max_difference).tolist()]
+    our_times = np.array([image.timestamp for image in ours])
+    their_times = np.array([image.timestamp for image in theirs])
+    indices = associate(our_times, their_times, max_difference_s).tolist()
+    pairs = [(ours[i], theirs[j]) for i, j in indices]
     if not pairs:
-        message = (
-            f"no image of {first.name} lies within {max_difference:g} s of one of {second.name}"
-        )
-        raise DataError(f"{first.parent}: {message}")
+        names = f"no image of {first.name} lies within {max_difference_s:g} s of one of"
+        raise DataError(f"{first.parent}: {names} {second.name}")
     return pairs, len(ours) - len(pairs)
 
 
 def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """[height, width, 3] uint8 RGB. Raises DataError when the file is missing, broken or of another
-    size.
+    """Read a color image.
+
+    Returns:
+        [height, width, 3] uint8 RGB.
+
+    Raises:
+        DataError: the file is missing, broken, or of another size than the camera's.
     """
     image = _decode(path, cv2.IMREAD_COLOR)
     _check_size(path, image.shape[:2], camera)
@@ -96,28 +75,97 @@ def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
-    """[height, width] m, 0 = no reading. Raises DataError unless it is a 16 bit image of the
-    camera's size.
+    """Read a depth image.
+
+    Returns:
+        [height, width] float32 m, 0 = no reading.
+
+    Raises:
+        DataError: the file is no 16-bit image of one channel, or as for `read_rgb`.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
-        raise DataError(
-            f"{path}: depth must be one channel of 16 bit, not {image.dtype} of shape {image.shape}"
-        )
+        found = f"{image.dtype} of shape {image.shape}"
+        raise DataError(f"{path}: depth must be one channel of 16 bits, not {found}")
     _check_size(path, image.shape, camera)
     return image.astype(np.float32) / np.float32(camera.depth_scale)
 
 
 def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
-    """[height, width] bool, True = dynamic (any value above 0 in the file). Raises DataError as
-    read_rgb does.
+    """Read a mask.
+
+    Returns:
+        [height, width] bool, True = dynamic, where the file is above 0.
+
+    Raises:
+        DataError: as for `read_rgb`.
     """
     image = _decode(path, cv2.IMREAD_GRAYSCALE)
     _check_size(path, image.shape, camera)
     return np.asarray(image > 0)
 
 
+def parse_line(path: Path, number: int, line: str) -> TimestampedImage | None:
+    """Parse a line of a list.
+
+    Args:
+        path: of the list; images are relative to its folder.
+        number: of the line.
+        line: its text.
+
+    Returns:
+        None for a comment and for an empty line.
+
+    Raises:
+        DataError: the line is broken; the message names file and line.
+    """
+    words = line.split()
+    if not words or words[0].startswith("#"):
+        return None
+    if len(words) != 2:
+        raise DataError(f"{path}:{number}: expected 'timestamp filename', found {len(words)} words")
+    text, name = words
+    try:
+        timestamp = float(text)
+    except ValueError as error:
+        raise DataError(f"{path}:{number}: timestamp {text!r} is not a number") from error
+    if not math.isfinite(timestamp):
+        raise DataError(f"{path}:{number}: timestamp {text!r} is not finite")
+    return TimestampedImage(timestamp, text, path.parent / name)
+
+
+def check_order(
+    path: Path, number: int, image: TimestampedImage, previous: TimestampedImage | None
+) -> None:
+    """Raise DataError unless the timestamp of a line is later than that of the line before."""
+    if previous is not None and image.timestamp <= previous.timestamp:
+        problem = f"{image.timestamp_text} does not come after {previous.timestamp_text}"
+        raise DataError(f"{path}:{number}: timestamp {problem}")
+
+
+def _read_list(path: Path) -> list[TimestampedImage]:
+    """Read a whole list, with DataError for the first line that cannot be used."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        hint = "a TUM sequence has rgb.txt and depth.txt, a stereo one left.txt and right.txt"
+        raise DataError(f"{path}: cannot be read; {hint} ({error})") from error
+    images: list[TimestampedImage] = []
+    for number, line in enumerate(lines, start=1):
+        image = parse_line(path, number, line)
+        if image is None:
+            continue
+        check_order(path, number, image, images[-1] if images else None)
+        if not image.path.is_file():
+            raise DataError(f"{path}:{number}: {line.split()[1]} does not exist in {path.parent}")
+        images.append(image)
+    if not images:
+        raise DataError(f"{path}: lists no image")
+    return images
+
+
 def _decode(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Read and decode an image file, with DataError for one that is missing or broken."""
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
@@ -129,47 +177,7 @@ def _decode(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
 
 
 def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
+    """Raise DataError unless an image has the camera's size."""
     if tuple(shape) != (camera.height, camera.width):
         found, expected = f"{shape[1]}x{shape[0]}", f"{camera.width}x{camera.height}"
-        raise DataError(f"{path}: image is {found}, the camera says {expected}")
-
-
-def _read_list(path: Path) -> list[Entry]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        layout = "a TUM sequence has rgb.txt and depth.txt, a stereo one left.txt and right.txt"
-        raise DataError(f"{path}: cannot be read; {layout} ({error})") from error
-    entries: list[Entry] = []
-    for number, line in enumerate(lines, start=1):
-        entry = read_entry(path, number, line)
-        if entry is None:
-            continue
-        if entries and entry.t <= entries[-1].t:
-            raise DataError(
-                f"{path}:{number}: time stamp {entry.stamp} does not come after {entries[-1].stamp}"
-            )
-        if not entry.image.is_file():
-            raise DataError(f"{path}:{number}: {line.split()[1]} does not exist in {path.parent}")
-        entries.append(entry)
-    if not entries:
-        raise DataError(f"{path}: lists no image")
-    return entries
-
-
-def read_entry(path: Path, number: int, line: str) -> Entry | None:
-    """A line of the list `path`; None for a comment and a blank one. Raises DataError naming file
-    and line.
-    """
-    words = line.split()
-    if not words or words[0].startswith("#"):
-        return None
-    if len(words) != 2:
-        raise DataError(f"{path}:{number}: expected 'timestamp filename', found {len(words)} words")
-    try:
-        stamp = float(words[0])
-    except ValueError as error:
-        raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not a number") from error
-    if not math.isfinite(stamp):
-        raise DataError(f"{path}:{number}: time stamp {words[0]!r} is not finite")
-    return Entry(stamp, words[0], path.parent / words[1])
+        raise DataError(f"{path}: image is {found}, but the camera is {expected}")

@@ -1,1 +1,1 @@
-"""Recognition of places seen before, and loop closure."""
+"""Loop closing: places seen before, their verification, and the correction of drift."""

@@ -1,6 +1,4 @@
-"""Is this the place seen before? Asked of the geometry of points, of neighbours and of the pictures
-themselves.
-"""
+"""Geometric and photometric verification of loop candidates."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import LoopVerificationConfig, MatchingConfig, RansacConfig
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.geometry.depth_image import DepthImage
@@ -19,28 +18,30 @@ from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.ransac import ransac_pose
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
-_PLACE = 8  # keyframes around the old one whose points make up the place
-_MIN_ROUGH = 20  # inliers of descriptor matches alone
-_MIN_INLIERS = 40  # of all the place's points
-_HYPOTHESES = 256
-_NEIGHBORS = 4
-_MIN_AGREE = 2  # of them
-_AGREE_M = 0.03
-_AGREE_RAD = 0.02
-_NO_WORSE = 1.02  # times the photometric error before
-_MIN_CORRELATION = 0.75
-_MIN_OVERLAP = 0.2
-_MIN_AGREEMENT = 0.7
-_REFINED_M = 0.05  # the pictures may move the points' answer this far
-_REFINED_RAD = 0.02
+
+@dataclass(frozen=True)
+class LoopVerifierConfig:
+    """Options of a loop verifier.
+
+    Attributes:
+        verification: thresholds, and image alignment.
+        matching: matching of the place's points.
+        ransac: pose from descriptor matches.
+    """
+
+    verification: LoopVerificationConfig = LoopVerificationConfig()
+    matching: MatchingConfig = MatchingConfig()
+    ransac: RansacConfig = RansacConfig()
 
 
 @dataclass(frozen=True)
-class Loop:
-    """A checked loop: for every entry, T carries from the camera of keyframe `old` to the camera of
-    keyframe `new`.
+class LoopConstraint:
+    """Verified loop between an old keyframe and the newest ones.
 
-    old: index; new: [l] indices, first the keyframe that found the loop; T: [l, 4, 4], m.
+    Attributes:
+        old: index of the old keyframe.
+        new: [l] indices of the new keyframes; the first one found the loop.
+        T: [l, 4, 4] m, camera of the old keyframe to the camera of each new one.
     """
 
     old: int
@@ -49,98 +50,147 @@ class Loop:
 
 
 class LoopVerifier:
-    """Checks candidates; all its randomness comes from `rng`."""
+    """Verifier of loop candidates."""
 
     def __init__(
-        self, world: Map, reprojection: ReprojectionModel, rng: np.random.Generator
+        self,
+        point_map: Map,
+        reprojection: ReprojectionModel,
+        config: LoopVerifierConfig,
+        rng: np.random.Generator,
     ) -> None:
-        self._world, self._reprojection, self._rng = world, reprojection, rng
+        """Set the map and the options. rng: source of all random samples."""
+        self._map = point_map
+        self._reprojection = reprojection
+        self._config = config.verification
+        self._matching = config.matching
+        self._ransac_config = config.ransac
+        self._rng = rng
 
-    def __call__(
-        self, keyframe: Keyframe, old: Keyframe, pictures: Mapping[int, DepthImage]
-    ) -> Loop | None:
-        """The loop between a keyframe and an old one, or None. pictures: of both, by index."""
-        ids = old.seen_points()
-        place = self._world.points_of(self._world.covisible(ids, _PLACE))
+    def verify(
+        self, keyframe: Keyframe, old: Keyframe, images: Mapping[int, DepthImage]
+    ) -> LoopConstraint | None:
+        """Verify that a keyframe shows the place of an old one.
+
+        Args:
+            keyframe: the newest.
+            old: the candidate.
+            images: of both, by keyframe index.
+
+        Returns:
+            The loop, or None where points, neighbors or images contradict it.
+        """
+        config = self._config
+        ids = old.observed_point_ids()
+        place = self._map.points_of(self._map.covisible(ids, config.place_keyframes))
         T_cw = self._locate(keyframe, ids, place)
         if T_cw is None:
             return None
-        neighbors = self._agreeing(keyframe, T_cw, place)
-        if len(neighbors) < _MIN_AGREE:
+        neighbors = self._agreeing_neighbors(keyframe, T_cw, place)
+        if len(neighbors) < config.min_agreeing:
             return None
-        T = self._align(T_cw @ inverse(old.T_cw), pictures[old.index], pictures[keyframe.index])
+        T = self._align(T_cw @ inverse(old.T_cw), images[old.index], images[keyframe.index])
         if T is None:
             return None
-        new = [keyframe.index, *(k.index for k, _ in neighbors)]
-        # The neighbours' own answers stand for themselves: an error in one edge is then not
-        # repeated in all.
-        Ts = [T, *(pose @ inverse(old.T_cw) for _, pose in neighbors)]
-        return Loop(old.index, np.array(new), np.stack(Ts))
+        new = [keyframe.index, *(neighbor.index for neighbor, _ in neighbors)]
+        # Neighbors keep their own poses, so that an error of one edge is not repeated in all.
+        transforms = [T, *(pose @ inverse(old.T_cw) for _, pose in neighbors)]
+        return LoopConstraint(old.index, np.array(new), np.stack(transforms))
 
     def _locate(
         self, keyframe: Keyframe, ids: NDArray[np.int64], place: NDArray[np.int64]
     ) -> Array | None:
-        """T_cw of a keyframe as if nothing were known about where it is: from points `ids` of an
-        old place by their descriptors, then from all its points."""
-        world, features = self._world, keyframe.features.without_subpixel
-        rough = self._ransac(features, match_descriptors(ids, world.descriptors[ids], features))
-        if rough is None:
-            return None
-        T_cw, inliers = rough, 0
-        for radius in (10.0, 5.0):
-            matches = match_projected(world.project(place, T_cw), features, radius)
-            seen = observations(features, matches.keypoints)
-            T_cw, inlier = optimize_pose(
-                T_cw, world.positions[matches.points], seen, self._reprojection
-            )
-            inliers = int(inlier.sum())
-        return T_cw if inliers >= _MIN_INLIERS else None
+        """Locate a keyframe in an old place, without using its current pose.
 
-    def _ransac(self, features: Features, matches: Matches) -> Array | None:
-        points, seen = (
-            self._world.positions[matches.points],
-            observations(features, matches.keypoints),
+        Args:
+            keyframe: to locate.
+            ids: points of the place to match by descriptors alone.
+            place: all points of the place, matched by projection afterwards.
+
+        Returns:
+            T_cw [4, 4], or None.
+        """
+        config, point_map = self._config, self._map
+        features = keyframe.features.without_subpixel
+        candidates = match_descriptors(ids, point_map.descriptors[ids], features, self._matching)
+        T_cw = self._solve_rough(features, candidates)
+        if T_cw is None:
+            return None
+        num_inliers = 0
+        for radius in (config.radius_rough_px, config.radius_px):
+            projected = point_map.project(place, T_cw)
+            matches = match_projected(projected, features, radius, self._matching)
+            observed = observations(features, matches.keypoints)
+            points = point_map.positions[matches.point_ids]
+            T_cw, inlier = optimize_pose(T_cw, points, observed, self._reprojection)
+            num_inliers = int(inlier.sum())
+        return T_cw if num_inliers >= config.min_inliers else None
+
+    def _solve_rough(self, features: Features, matches: Matches) -> Array | None:
+        """Estimate a pose T_cw [4, 4] from descriptor matches alone, or return None."""
+        config = self._config
+        points = self._map.positions[matches.point_ids]
+        observed = observations(features, matches.keypoints)
+        if len(matches) < config.min_inliers_rough:
+            return None
+        found = ransac_pose(
+            points,
+            observed,
+            self._map.camera,
+            self._rng,
+            self._ransac_config,
+            config.hypotheses,
         )
-        if len(matches) < _MIN_ROUGH:
+        if found is None or found[1].sum() < config.min_inliers_rough:
             return None
-        found = ransac_pose(points, seen, self._world.camera, self._rng, _HYPOTHESES)
-        if found is None or found[1].sum() < _MIN_ROUGH:
-            return None
-        T_cw, agree = found
-        return optimize_pose(T_cw, points[agree], seen.take(agree), self._reprojection, rounds=1)[0]
+        T_cw, inlier = found
+        inlier_points, inlier_observed = points[inlier], observed.take(inlier)
+        refined = optimize_pose(T_cw, inlier_points, inlier_observed, self._reprojection, rounds=1)
+        return refined[0]
 
-    def _agreeing(
+    def _agreeing_neighbors(
         self, keyframe: Keyframe, T_cw: Array, place: NDArray[np.int64]
     ) -> list[tuple[Keyframe, Array]]:
-        """Neighbours of the keyframe that, asked by themselves, find it in the same spot; with
-        their own poses.
+        """Locate the covisible keyframes by themselves, and keep those that agree with T_cw.
+
+        Returns:
+            Neighbors, each with its own pose T_cw [4, 4] in the old place.
         """
-        around = [
-            k
-            for k in self._world.covisible(keyframe.seen_points(), _NEIGHBORS + 1)
-            if k is not keyframe
-        ]
-        result = []
-        for neighbor in around[:_NEIGHBORS]:
-            own = self._locate(neighbor, place, place)
-            if own is None:
+        config = self._config
+        covisible = self._map.covisible(keyframe.observed_point_ids(), config.neighbors + 1)
+        neighbors = [neighbor for neighbor in covisible if neighbor is not keyframe]
+        agreeing = []
+        for neighbor in neighbors[: config.neighbors]:
+            located = self._locate(neighbor, place, place)
+            if located is None:
                 continue
             expected = neighbor.T_cw @ inverse(keyframe.T_cw) @ T_cw
-            if _near(own @ inverse(expected), _AGREE_M, _AGREE_RAD):
-                result.append((neighbor, own))
-        return result
+            if _is_small(located @ inverse(expected), config.agree_m, config.agree_rad):
+                agreeing.append((neighbor, located))
+        return agreeing
 
-    def _align(self, T: Array, of_map: DepthImage, local: DepthImage) -> Array | None:
-        """T refined by the pictures, if they confirm it (paper 2.3, equations 10 to 12)."""
-        found = align(of_map, local, T)
-        if found is None or found.after > _NO_WORSE * found.before:
+    def _align(self, T: Array, old: DepthImage, new: DepthImage) -> Array | None:
+        """Refine T by direct image alignment (paper section 2.3, eqs. 10 to 12).
+
+        Returns:
+            [4, 4] camera of the old image to that of the new one; None where the images contradict.
+        """
+        config = self._config
+        alignment = align(old, new, T, config)
+        if alignment is None or alignment.after > config.max_error_ratio * alignment.before:
             return None
-        sure = found.correlation >= _MIN_CORRELATION
-        sure &= found.overlap >= _MIN_OVERLAP and found.agreement >= _MIN_AGREEMENT
-        return found.T if sure and _near(found.T @ inverse(T), _REFINED_M, _REFINED_RAD) else None
+        is_confirmed = (
+            alignment.correlation >= config.min_correlation
+            and alignment.overlap >= config.min_overlap
+            and alignment.agreement >= config.min_depth_agreement
+        )
+        correction = alignment.T @ inverse(T)
+        limits = config.max_correction_m, config.max_correction_rad
+        return alignment.T if is_confirmed and _is_small(correction, *limits) else None
 
 
-def _near(T: Array, meters: float, radians: float) -> bool:
-    """Whether a rigid motion moves the camera and turns it by less than this."""
+def _is_small(T: Array, max_distance_m: float, max_angle_rad: float) -> bool:
+    """Check that a rigid motion [4, 4] stays below a translation and a rotation."""
     cosine = (np.trace(T[:3, :3]) - 1) / 2
-    return bool(np.linalg.norm(T[:3, 3]) < meters and np.arccos(np.clip(cosine, -1, 1)) < radians)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    return bool(np.linalg.norm(T[:3, 3]) < max_distance_m and angle < max_angle_rad)

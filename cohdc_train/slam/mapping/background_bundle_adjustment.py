@@ -10,13 +10,14 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from cohdc_train.slam.config import BundleAdjustmentConfig
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.local_bundle_adjustment import (
     Solution,
     Window,
-    close_window,
-    open_window,
+    apply_solution,
+    build_window,
     solve,
 )
 from cohdc_train.slam.mapping.map import Map
@@ -26,9 +27,12 @@ from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 class BackgroundMapper:
     """Bundle adjustments, one after the other, in an executor."""
 
-    def __init__(self, executor: Executor, reprojection: ReprojectionModel) -> None:
+    def __init__(
+        self, executor: Executor, reprojection: ReprojectionModel, config: BundleAdjustmentConfig
+    ) -> None:
         self._executor = executor
         self._reprojection = reprojection
+        self._config = config
         self._running: tuple[Window, Future[Solution]] | None = None
         self._waiting: Keyframe | None = None
 
@@ -42,32 +46,33 @@ class BackgroundMapper:
             else waiting | {k.index for k in self._running[0].keyframes}
         )
 
-    def start(self, world: Map, keyframe: Keyframe) -> None:
+    def start(self, point_map: Map, keyframe: Keyframe) -> None:
         """Adjust the keyframe's window as soon as the one under way is done."""
         if self._running is not None:
             self._waiting = keyframe
             return
-        window = open_window(world, keyframe)
+        window = build_window(point_map, keyframe, self._config)
         poses = np.stack(window.poses)
-        job = self._executor.submit(solve, poses, window.points, window.problem, self._reprojection)
+        problem = poses, window.points, window.problem, self._reprojection, self._config
+        job = self._executor.submit(solve, *problem)
         self._running = window, job
 
-    def collect(self, world: Map) -> Array | None:
+    def collect(self, point_map: Map) -> Array | None:
         """Put a finished result into the map. Returns the motion of `close_window`, None when there
         is none.
         """
         if self._running is None or not self._running[1].done():
             return None
         window, job = self._running
-        motion = close_window(world, window, job.result())
+        motion = apply_solution(point_map, window, job.result())
         self._running, waiting = None, self._waiting
         self._waiting = None
         if waiting is not None:
-            self.start(world, waiting)
+            self.start(point_map, waiting)
         return motion
 
-    def finish(self, world: Map) -> None:
+    def finish(self, point_map: Map) -> None:
         """Wait for what is under way and what waits, and put it into the map."""
         while self._running is not None:
             self._running[1].result()
-            self.collect(world)
+            self.collect(point_map)

@@ -10,19 +10,19 @@ import numpy as np
 from cohdc_train.slam.geometry.se3 import Array, inverse
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
+from cohdc_train.slam.optimization.trajectory_smoothing import TrackedPoses
 
 
 class _Logged(NamedTuple):
     """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in
-    it, m; information: [6, 6] inverse covariance of the pose; pull: [6] gradient of what was
+    it, m; information: [6, 6] inverse covariance of the pose; prior_gradient: [6] gradient of what was
     expected of it."""
 
-    t: float
+    timestamp: float
     reference: int
     relative: Array
     information: Array
-    pull: Array
+    prior_gradient: Array
 
 
 class FrameHistory:
@@ -33,51 +33,56 @@ class FrameHistory:
 
     def append(
         self,
-        t: float,
+        timestamp: float,
         T_cw: Array,
-        reference: Keyframe,
+        reference: Keyframe | None,
         information: Array,
-        pull: Array,
-        world: Map,
+        prior_gradient: Array,
+        point_map: Map,
     ) -> int:
-        """Append the frame at t, s. Returns its row.
+        """Append the frame at a timestamp, s. Returns its row.
 
         T_cw: [4, 4] world to camera, m; reference: the keyframe it stays relative to; information,
-        pull: as `_Logged`.
+        prior_gradient: as `_Logged`.
         """
-        relative = T_cw @ inverse(world.pose(reference.index))
-        self._frames.append(_Logged(t, reference.index, relative, information, pull))
+        if reference is None:
+            raise ValueError(f"frame at {timestamp:.6f} s has no reference keyframe")
+        relative = T_cw @ inverse(point_map.pose(reference.index))
+        self._frames.append(
+            _Logged(timestamp, reference.index, relative, information, prior_gradient)
+        )
         return len(self._frames) - 1
 
     @property
-    def stamps(self) -> Array:
+    def timestamps(self) -> Array:
         """[n] s."""
-        return np.array([frame.t for frame in self._frames])
+        return np.array([frame.timestamp for frame in self._frames])
 
-    def poses(self, world: Map) -> Array:
+    def poses(self, point_map: Map) -> Array:
         """Return poses [n, 4, 4] T_cw world to camera, m, as the map has them now.
 
         Each frame is re-derived from its reference keyframe, or from that one's successor.
         """
         references = [frame.reference for frame in self._frames]
-        keyframes = {index: world.pose(index) for index in set(references)}
+        keyframes = {index: point_map.pose(index) for index in set(references)}
         poses = [frame.relative @ keyframes[frame.reference] for frame in self._frames]
         return np.stack(poses) if poses else np.zeros((0, 4, 4))
 
-    def put(self, world: Map, rows: Sequence[int], poses: Array) -> None:
+    def update_poses(self, point_map: Map, rows: Sequence[int], poses: Array) -> None:
         """The frames in rows [m] are at poses [m, 4, 4] T_cw, m, in the map as it is now."""
         for row, pose in zip(rows, poses, strict=True):
             frame = self._frames[row]
-            self._frames[row] = frame._replace(relative=pose @ inverse(world.pose(frame.reference)))
-
-    def trajectory(self, world: Map, smooth: bool) -> tuple[Array, Array]:
-        """Stamps [n] s and poses [n, 4, 4] T_wc camera to world, m, of all frames, as the map has
-        them now.
-        """
-        stamps, poses = self.stamps, self.poses(world)
-        if smooth and len(poses):
-            information = np.stack([frame.information for frame in self._frames])
-            poses = smoothed(
-                stamps, poses, information, np.stack([frame.pull for frame in self._frames])
+            self._frames[row] = frame._replace(
+                relative=pose @ inverse(point_map.pose(frame.reference))
             )
-        return stamps, inverse(poses)
+
+    def tracked_poses(self, point_map: Map) -> TrackedPoses:
+        """Return all frames for smoothing, with poses as the map has them now."""
+        information = [frame.information for frame in self._frames]
+        gradients = [frame.prior_gradient for frame in self._frames]
+        return TrackedPoses(
+            self.timestamps,
+            self.poses(point_map),
+            np.stack(information) if information else np.zeros((0, 6, 6)),
+            np.stack(gradients) if gradients else np.zeros((0, 6)),
+        )

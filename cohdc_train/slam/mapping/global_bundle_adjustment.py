@@ -4,33 +4,30 @@ A keyframe every half second is what mapping has time for on the way. The frames
 every point ten times more often.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.config import FEW
+from cohdc_train.slam.config import BundleAdjustmentConfig
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.frame_history import FrameHistory
 from cohdc_train.slam.mapping.keyframe import observations
 from cohdc_train.slam.mapping.local_bundle_adjustment import (
-    Sighting,
-    close_window,
+    FrameObservations,
+    apply_solution,
     select_window,
     solve,
 )
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel
 
-_MOST = 256  # frames, about 25 kB each; when there are more, every other one goes
-_TURNS = 2  # a matched frame gives only every second of its points, another one the others: a quarter of the time
-
 
 class _Kept(NamedTuple):
-    """row: of the frame in the log; ids: [m] points that it saw; born: [m] keyframe index of each,
+    """row: of the frame in the history; ids: [m] points that it saw; born: [m] keyframe index of each,
     for a younger point may take the row of one that is gone; seen: the m measurements."""
 
     row: int
@@ -39,73 +36,90 @@ class _Kept(NamedTuple):
     seen: Observations
 
 
-class ObservedFrames:
+class IntermediateFrames:
     """Frames by what they saw of the map, evenly thinned: so many are kept that memory is bounded."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: BundleAdjustmentConfig, min_points: int) -> None:
+        """Keep at most config.max_frames frames, of min_points points or more."""
+        self._config = config
+        self._min_points = min_points
         self._kept: list[_Kept] = []
         self._every = 1
         self._count = 0
 
-    def chosen(self, seen: Matches, matched: bool) -> Matches | None:
-        """What is wanted of the next settled frame, if anything; seen: the points it sees; matched:
-        against the map, so that it saw all it can.
+    def add(
+        self,
+        row: int,
+        matches: Matches,
+        from_map: bool,
+        features_of: Callable[[Matches], Features],
+        point_map: Map,
+    ) -> None:
+        """Add the next tracked frame, of which all, some, or no measurements are kept.
 
-        One that saw little is not kept: what it gives would not do for a pose.
+        row: of the frame in the history; from_map: it was matched with the map, so that it sees all
+        it can; features_of: makes the frame's keypoints once it is known which matches are kept. A
+        frame that sees too few points for a pose is not kept.
         """
-        turns = _TURNS if matched else 1
-        if len(seen) < turns * FEW:
-            return None
+        turns = self._config.point_subsample if from_map else 1
+        if len(matches) < turns * self._min_points:
+            return
         number, self._count = self._count, self._count + 1
         if number % self._every:
-            return None
-        turn = (
-            number.bit_count()
-        )  # odd and even by turns, whichever powers of two are left out later on
-        return seen.take((seen.points + turn) % turns == 0)
-
-    def append(self, row: int, matches: Matches, features: Features, world: Map) -> None:
-        """What was chosen of the frame in a row of the log, after those before it, and its corners."""
-        ids, seen = matches.points, observations(features, matches.keypoints)
-        self._kept.append(_Kept(row, ids, world.first_keyframe[ids], seen))
-        if len(self._kept) > _MOST:
+            return
+        # Odd and even in turns, whichever powers of two are left out later on.
+        turn = number.bit_count()
+        kept = matches.take((matches.point_ids + turn) % turns == 0)
+        seen = observations(features_of(kept), kept.keypoints)
+        self._kept.append(
+            _Kept(row, kept.point_ids, point_map.first_keyframe[kept.point_ids], seen)
+        )
+        if len(self._kept) > self._config.max_frames:
             self._kept = self._kept[::2]
             self._every *= 2
 
-    def adjust(self, world: Map, reprojection: ReprojectionModel, log: FrameHistory) -> None:
+    def adjust(
+        self, point_map: Map, reprojection: ReprojectionModel, history: FrameHistory
+    ) -> None:
         """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are
-        moved in the log; others stay where they lie from their reference keyframes.
+        moved in the history; others stay where they lie from their reference keyframes.
 
         Without the first step a map that loops have moved is still too far off when the few of the
         second are over.
         """
-        adjust_everything(world, reprojection)
-        stamps, keyframes = log.stamps, {keyframe.t for keyframe in world.keyframes}
+        adjust_everything(point_map, reprojection, self._config)
+        stamps, keyframes = (
+            history.timestamps,
+            {keyframe.timestamp for keyframe in point_map.keyframes},
+        )
         others = [kept for kept in self._kept if stamps[kept.row] not in keyframes]
         if not others:
             return
-        poses = log.poses(world)
-        sightings = [_sighting(kept, poses[kept.row], world) for kept in others]
-        log.put(
-            world, [kept.row for kept in others], adjust_everything(world, reprojection, sightings)
-        )
+        poses = history.poses(point_map)
+        observed = [_frame_observations(kept, poses[kept.row], point_map) for kept in others]
+        adjusted = adjust_everything(point_map, reprojection, self._config, observed)
+        history.update_poses(point_map, [kept.row for kept in others], adjusted)
 
 
-def _sighting(kept: _Kept, T_cw: Array, world: Map) -> Sighting:
+def _frame_observations(kept: _Kept, T_cw: Array, point_map: Map) -> FrameObservations:
     """What a frame saw of points that are still there."""
-    same = np.flatnonzero(world.first_keyframe[kept.ids] == kept.first_keyframe)
-    ids = world.current(kept.ids[same])
-    there = np.flatnonzero(world.num_observations[ids] > 0)
+    same = np.flatnonzero(point_map.first_keyframe[kept.ids] == kept.first_keyframe)
+    ids = point_map.resolve_merged(kept.ids[same])
+    there = np.flatnonzero(point_map.num_observations[ids] > 0)
     ids, first = np.unique(ids[there], return_index=True)
-    return Sighting(T_cw, ids, kept.seen.take(same[there[first]]))
+    return FrameObservations(T_cw, ids, kept.seen.take(same[there[first]]))
 
 
 def adjust_everything(
-    world: Map, reprojection: ReprojectionModel, sightings: Sequence[Sighting] = ()
+    point_map: Map,
+    reprojection: ReprojectionModel,
+    config: BundleAdjustmentConfig,
+    observed: Sequence[FrameObservations] = (),
 ) -> Array:
     """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first
     keyframe holds still. Returns [s, 4, 4] T_cw of those frames, m."""
-    window = select_window(world, list(world.keyframes), 1, sightings)
-    solution = solve(np.stack(window.poses), window.points, window.problem, reprojection)
-    close_window(world, window, solution)
+    window = select_window(point_map, list(point_map.keyframes), 1, observed)
+    poses = np.stack(window.poses)
+    solution = solve(poses, window.points, window.problem, reprojection, config)
+    apply_solution(point_map, window, solution)
     return solution.poses[len(window.keyframes) :]

@@ -12,23 +12,23 @@ from cohdc_train.slam.optimization.reprojection import Observations
 
 @dataclass(eq=False)
 class Keyframe:
-    """A frame the map keeps.
+    """Frame that the map keeps, with the points it observes.
 
-    index: its number, Map.joined when it joins, not used again; t: s; T_cw: [4, 4] world to camera,
-    m; point_ids: [n] int64, the map point of every corner or -1; thumbnail: [h, w] float32, zero
-    mean and unit norm, for finding the place again; nearest: [h, w] coarse depth as
-    Geometry.nearest gives it, m.
+    index: its number, not used again; timestamp: s; T_cw: [4, 4] world to camera,
+    m; point_ids: [n] int64, the map point of every keypoint or -1; thumbnail: [h, w] float32, zero
+    mean and unit norm, for relocalization; min_depth_grid: [h, w] m, as
+    FreeSpaceChecker.min_depth_grid gives it.
     """
 
     index: int
-    t: float
+    timestamp: float
     T_cw: Array
     features: Features
     point_ids: NDArray[np.int64]
     thumbnail: NDArray[np.float32]
-    nearest: NDArray[np.float32]
+    min_depth_grid: NDArray[np.float32]
 
-    def seen_points(self) -> NDArray[np.int64]:
+    def observed_point_ids(self) -> NDArray[np.int64]:
         """Ids of the points this keyframe sees."""
         return self.point_ids[self.point_ids >= 0]
 
@@ -41,5 +41,5 @@ def observations(features: Features, keypoints: NDArray[np.int64]) -> Observatio
     """What a frame measured at some of its corners."""
     sigmas, depth_sigmas = features.sigmas[keypoints], features.scales[keypoints]
     return Observations(
-        features.points[keypoints], features.depths[keypoints], sigmas, depth_sigmas
+        features.undistorted[keypoints], features.depths[keypoints], sigmas, depth_sigmas
     )

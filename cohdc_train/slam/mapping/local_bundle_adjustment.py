@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import BundleAdjustmentConfig
 from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.bundle_adjustment import Problem, adjust, measurement_chi2
-from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel, joined
-
-WINDOW = 12  # keyframes in local bundle adjustment
-FIXED = 3  # of them hold still and carry the frame of reference
+from cohdc_train.slam.optimization.reprojection import Observations, ReprojectionModel, concatenate
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class FrameObservations:
     """What a frame that is no keyframe saw. T_cw: [4, 4] world to camera, m; ids: [m] map points,
     none of them twice;
     seen: the m measurements, as of points that surely stand still."""
@@ -57,52 +55,64 @@ class Solution:
     good: NDArray[np.bool_]
 
 
-def open_window(world: Map, keyframe: Keyframe) -> Window:
-    """The keyframe with those that share most points, and their measurements."""
-    keyframes = world.covisible(keyframe.seen_points(), WINDOW)
+def build_window(point_map: Map, keyframe: Keyframe, config: BundleAdjustmentConfig) -> Window:
+    """Build the window of a keyframe: those that share most points with it, and what they observe.
+
+    At most a quarter of the keyframes is fixed.
+    """
+    keyframes = point_map.covisible(keyframe.observed_point_ids(), config.local_keyframes)
     keyframes.sort(key=lambda k: k.index)
-    return select_window(world, keyframes, max(1, min(FIXED, len(keyframes) // 4)))
+    num_fixed = max(1, min(config.local_fixed, len(keyframes) // 4))
+    return select_window(point_map, keyframes, num_fixed)
 
 
 def select_window(
-    world: Map, keyframes: list[Keyframe], fixed: int, sightings: Sequence[Sighting] = ()
+    point_map: Map,
+    keyframes: list[Keyframe],
+    fixed: int,
+    observed: Sequence[FrameObservations] = (),
 ) -> Window:
     """Keyframes, the newest last, of which the first few are fixed, with all measurements of the
     others' points.
     """
-    ids = world.points_of(keyframes[fixed:])
-    row = np.full(world.size + 1, -1)
+    ids = point_map.points_of(keyframes[fixed:])
+    row = np.full(point_map.size + 1, -1)
     row[ids] = np.arange(len(ids))
-    named = [k.point_ids for k in keyframes] + [s.ids for s in sightings]
+    named = [k.point_ids for k in keyframes] + [s.ids for s in observed]
     keypoints = [np.flatnonzero(row[points] >= 0) for points in named]
     points = [row[all_of_them[c]] for all_of_them, c in zip(named, keypoints, strict=True)]
     seen = [observations(k.features, c) for k, c in zip(keyframes, keypoints, strict=False)]
-    seen += [s.seen.take(c) for s, c in zip(sightings, keypoints[len(keyframes) :], strict=True)]
+    seen += [s.seen.take(c) for s, c in zip(observed, keypoints[len(keyframes) :], strict=True)]
     rows = np.concatenate(points)
     problem = Problem(
         cameras=np.repeat(np.arange(len(keypoints)), [len(c) for c in keypoints]),
         points=rows,
-        seen=joined(seen).trusted(world.trust(ids)[rows]),
+        seen=concatenate(seen).weighted(point_map.static_weight(ids)[rows]),
         free=np.arange(len(keypoints)) >= fixed,
     )
-    poses = [k.T_cw for k in keyframes] + [s.T_cw for s in sightings]
-    return Window(keyframes, poses, ids, world.positions[ids], problem, np.concatenate(keypoints))
+    poses = [k.T_cw for k in keyframes] + [s.T_cw for s in observed]
+    return Window(
+        keyframes, poses, ids, point_map.positions[ids], problem, np.concatenate(keypoints)
+    )
 
 
 def solve(
-    poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel
+    poses: Array,
+    points: Array,
+    problem: Problem,
+    reprojection: ReprojectionModel,
+    config: BundleAdjustmentConfig,
 ) -> Solution:
-    """Robustly first, then once more without the measurements that do not fit. Arrays as in
-    `Window`.
-    """
-    poses, points = adjust(poses, points, problem, reprojection, steps=5)
-    good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
-    poses, points = adjust(poses, points, problem.take(good), reprojection, steps=3, robust=False)
-    good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.limits
+    """Minimize the robust cost, then the squared one without outliers. Arrays as in `Window`."""
+    poses, points = adjust(poses, points, problem, reprojection, config.robust_steps)
+    good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.chi2_thresholds
+    inliers, steps = problem.take(good), config.final_steps
+    poses, points = adjust(poses, points, inliers, reprojection, steps, robust=False)
+    good = measurement_chi2(poses, points, problem, reprojection) <= problem.seen.chi2_thresholds
     return Solution(poses, points, good)
 
 
-def close_window(world: Map, window: Window, solution: Solution) -> Array | None:
+def apply_solution(point_map: Map, window: Window, solution: Solution) -> Array | None:
     """Put a solution into the map; measurements that do not fit are dropped.
 
     The map may have changed since the window was opened: what was added moves along with the
@@ -116,28 +126,31 @@ def close_window(world: Map, window: Window, solution: Solution) -> Array | None
     last = len(window.keyframes) - 1
     motion: Array = inverse(window.poses[last]) @ solution.poses[last]
     newest = window.keyframes[last].index
-    for keyframe in world.keyframes:
+    for keyframe in point_map.keyframes:
         if keyframe.index > newest:
             keyframe.T_cw = keyframe.T_cw @ motion
-    added = np.flatnonzero(world.first_keyframe[: world.size] > newest)
-    world.positions[added] = to_local(inverse(motion), world.positions[added])
+    added = np.flatnonzero(point_map.first_keyframe[: point_map.size] > newest)
+    point_map.positions[added] = to_local(inverse(motion), point_map.positions[added])
     same = (
-        world.first_keyframe[window.ids] <= newest
+        point_map.first_keyframe[window.ids] <= newest
     )  # a younger point may have taken the row of one that is gone
-    world.positions[window.ids[same]] = solution.points[same]
+    point_map.positions[window.ids[same]] = solution.points[same]
     for slot, member in enumerate(window.keyframes):
         member.T_cw = solution.poses[slot]
         rows = (window.problem.cameras == slot) & ~solution.good
         keypoints, ids = window.keypoints[rows], window.ids[window.problem.points[rows]]
-        world.forget(member, keypoints[member.point_ids[keypoints] == ids])
+        point_map.forget(member, keypoints[member.point_ids[keypoints] == ids])
     return motion
 
 
-def adjust_window(world: Map, keyframe: Keyframe, reprojection: ReprojectionModel) -> None:
-    """Bundle-adjust the newest keyframe with those that share most points; measurements that do not
-    fit are dropped.
-    """
-    window = open_window(world, keyframe)
-    close_window(
-        world, window, solve(np.stack(window.poses), window.points, window.problem, reprojection)
-    )
+def adjust_window(
+    point_map: Map,
+    keyframe: Keyframe,
+    reprojection: ReprojectionModel,
+    config: BundleAdjustmentConfig,
+) -> None:
+    """Bundle-adjust the newest keyframe with those that share most points, and drop outliers."""
+    window = build_window(point_map, keyframe, config)
+    poses = np.stack(window.poses)
+    solution = solve(poses, window.points, window.problem, reprojection, config)
+    apply_solution(point_map, window, solution)

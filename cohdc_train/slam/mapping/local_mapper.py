@@ -3,127 +3,148 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from typing import Protocol
 
-from cohdc_train.slam.config import Method
+from cohdc_train.slam.config import BundleAdjustmentConfig, KeyframeCullingConfig
+from cohdc_train.slam.features.patch_alignment import Pyramid
 from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.mapping.background_bundle_adjustment import BackgroundMapper
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.keyframe_culling import cull_keyframes
 from cohdc_train.slam.mapping.local_bundle_adjustment import adjust_window
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.map_points import add_points, cull, fuse
+from cohdc_train.slam.mapping.map_points import add_points, cull_map_points, fuse
 from cohdc_train.slam.mapping.patch_refiner import PatchRefiner
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
+
+
+@dataclass(frozen=True)
+class LocalMapperConfig:
+    """Options of a local mapper. max_depth_m: farthest depth at which a point is created, m."""
+
+    bundle_adjustment: BundleAdjustmentConfig
+    keyframe_culling: KeyframeCullingConfig
+    max_depth_m: float
 
 
 class LoopCloserLike(Protocol):
     """Closer of loops among the keyframes of a map."""
 
     closed: int
+    image_px: int
 
     @property
-    def ends(self) -> set[int]:
+    def loop_keyframes(self) -> set[int]:
         """Indices of the keyframes that loops refer to."""
 
-    def close(self, keyframe: Keyframe, picture: DepthImage) -> bool:
-        """Look for a loop with the newest keyframe. Returns whether the map moved."""
+    def close(self, keyframe: Keyframe, image: DepthImage) -> None:
+        """Look for a loop with the newest keyframe. The map may move."""
 
     def forget(self, keyframe: Keyframe) -> None:
         """Forget a keyframe that the map gave up."""
 
 
 class LocalMapper:
-    """Takes keyframes into a map and puts it in order.
+    """Insertion of keyframes into a map, and the upkeep that follows.
 
-    refiner: cuts out the patches of new points; loop_closer: closes loops with every keyframe, None
-    closes none;
-    executor: where bundle adjustment runs, in parallel with tracking
-    (`background_bundle_adjustment`), None waits for it; in_parts: what can wait is done by `work`,
-    a part at a time.
+    refiner: stores the patches of new points; loop_closer: looks for a loop with every keyframe,
+    None closes none; executor: runs bundle adjustment in parallel with tracking, None waits for it;
+    incremental: what can wait is left to `run_next_task`.
     """
 
     def __init__(
         self,
-        world: Map,
+        point_map: Map,
         reprojection: ReprojectionModel,
-        method: Method,
+        config: LocalMapperConfig,
         refiner: PatchRefiner | None,
         loop_closer: LoopCloserLike | None,
         executor: Executor | None,
-        in_parts: bool,
+        incremental: bool,
     ) -> None:
-        self._world, self._reprojection = world, reprojection
-        self._mapper = None if executor is None else BackgroundMapper(executor, reprojection)
+        self._map, self._reprojection = point_map, reprojection
+        self._config = config
+        self._mapper = (
+            None
+            if executor is None
+            else BackgroundMapper(executor, reprojection, config.bundle_adjustment)
+        )
         self._refiner = refiner
         self._loops = loop_closer
-        self._culls_keyframes = method.keyframe_culling
-        self._in_parts = in_parts
-        self._parts: deque[Callable[[], None]] = deque()
+        self._incremental = incremental
+        self._tasks: deque[Callable[[], None]] = deque()
 
     @property
-    def loops(self) -> int:
-        """How many loops were closed."""
+    def num_loops(self) -> int:
+        """Loops closed so far."""
         return 0 if self._loops is None else self._loops.closed
 
     @property
-    def busy(self) -> bool:
-        """Whether something is left to do of the latest keyframe."""
-        return bool(self._parts)
+    def is_idle(self) -> bool:
+        """Whether all tasks of the latest keyframe are done."""
+        return not self._tasks
 
-    def insert(self, keyframe: Keyframe, picture: Callable[[], DepthImage]) -> None:
-        """A tracked keyframe joins, and its corners of known depth become points. Then: duplicates
-        merged, bundle adjustment, weak points out; loops, superfluous keyframes out.
+    def insert(
+        self, keyframe: Keyframe, patches: Pyramid | None, make_image: Callable[[int], DepthImage]
+    ) -> None:
+        """Insert a tracked keyframe, and create points at its keypoints with depth.
 
-        picture: makes what loop closing keeps of it. Must not be called while `busy`.
+        Then: duplicates fused, bundle adjustment, weak points removed; loops, redundant keyframes
+        removed. patches: image pyramid for the refiner; make_image: makes the image for loop
+        closing, whose longer side it is given in px. Tasks left of the keyframe before are finished
+        first.
         """
-        assert not self.busy
-        self._world.add_keyframe(keyframe)
-        add_points(self._world, keyframe)
-        if self._refiner is not None:
-            self._refiner.remember(keyframe)
-        self._parts.extend(
-            [lambda: self._settle(keyframe), lambda: self._look_back(keyframe, picture)]
+        self._run_all_tasks()
+        self._map.add_keyframe(keyframe)
+        add_points(self._map, keyframe, self._config.max_depth_m)
+        if self._refiner is not None and patches is not None:
+            self._refiner.store(keyframe, patches)
+        self._tasks.extend(
+            [lambda: self._settle(keyframe), lambda: self._look_back(keyframe, make_image)]
         )
-        if not self._in_parts:
-            self._finish_parts()
+        if not self._incremental:
+            self._run_all_tasks()
 
-    def work(self) -> None:
-        """One part of what is left, if anything. Keyframes may move."""
-        if self._parts:
-            self._parts.popleft()()
+    def run_next_task(self) -> None:
+        """Run the next task, if any. Keyframes may move."""
+        if self._tasks:
+            self._tasks.popleft()()
 
-    def collect(self) -> None:
-        """What was adjusted beside tracking goes into the map. Keyframes may move."""
+    def apply_finished_adjustment(self) -> None:
+        """Apply a bundle adjustment that has finished in parallel. Keyframes may move."""
         if self._mapper is not None:
-            self._mapper.collect(self._world)
+            self._mapper.collect(self._map)
 
     def finish(self) -> None:
-        """Do all that is left."""
-        self._finish_parts()
+        """Run all tasks, and wait for bundle adjustment."""
+        self._run_all_tasks()
         if self._mapper is not None:
-            self._mapper.finish(self._world)
+            self._mapper.finish(self._map)
 
-    def _finish_parts(self) -> None:
-        while self._parts:
-            self.work()
+    def _run_all_tasks(self) -> None:
+        while self._tasks:
+            self.run_next_task()
 
     def _settle(self, keyframe: Keyframe) -> None:
-        if len(self._world.keyframes) == 1:
+        if len(self._map.keyframes) == 1:
             return
-        fuse(self._world, keyframe)
+        fuse(self._map, keyframe)
         if self._mapper is None:
-            adjust_window(self._world, keyframe, self._reprojection)
+            config = self._config.bundle_adjustment
+            adjust_window(self._map, keyframe, self._reprojection, config)
         else:
-            self._mapper.start(self._world, keyframe)
-        cull(self._world, keyframe.index)
+            self._mapper.start(self._map, keyframe)
+        cull_map_points(self._map, keyframe.index)
 
-    def _look_back(self, keyframe: Keyframe, picture: Callable[[], DepthImage]) -> None:
+    def _look_back(self, keyframe: Keyframe, make_image: Callable[[int], DepthImage]) -> None:
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
         if self._loops is not None:
-            self._loops.close(keyframe, picture())
-            in_use = in_use | self._loops.ends
-        if self._culls_keyframes:
-            for removed in cull_keyframes(self._world, keyframe, in_use):
+            self._loops.close(keyframe, make_image(self._loops.image_px))
+            in_use = in_use | self._loops.loop_keyframes
+        culling = self._config.keyframe_culling
+        if culling.enabled:
+            window = self._config.bundle_adjustment.local_keyframes
+            for removed in cull_keyframes(self._map, keyframe, in_use, culling, window):
                 if self._loops is not None:
                     self._loops.forget(removed)

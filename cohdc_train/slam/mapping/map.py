@@ -3,36 +3,39 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.keypoints import LEVELS, SCALE, Features
+from cohdc_train.slam.config import MappingConfig, MatchingConfig, MotionSegmentationConfig
+from cohdc_train.slam.features.keypoints import Features, ScalePyramid
 from cohdc_train.slam.features.matching import Matches, Projected
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.optimization.reprojection import Observations
 
-_NEAR = 0.1  # m
-_OBSERVERS = 8  # of the keyframes that see a point, mostly the newest, it remembers so many
-_NEIGHBORS = 64  # keyframes that are looked at when those that share most points are sought
-_STILL = 3.0  # log-odds that a new point stands still
-_WENT, _STOOD, _CERTAIN = (
-    2.0,
-    0.25,
-    8.0,
-)  # log-odds of moving: more per frame that says so, less per frame, at most
-_VIEW_COSINE = 0.5  # a point is looked for within 60 degrees of the directions it was seen from
-
 
 class Map:
-    """Points live in arrays that grow by doubling; an id is a row, which a new point takes when no
-    keyframe sees the one in it any more.
+    """Sparse map of keyframes and points.
 
-    keyframes: those that are in the map, index rising; joined: how many ever were.
+    Points live in arrays that grow by doubling; an id is a row, which a new point takes when no
+    keyframe observes the point in it any more.
+
+    keyframes: those in the map, index rising; joined: how many were ever inserted.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        pyramid: ScalePyramid = ScalePyramid(),
+        config: MappingConfig = MappingConfig(),
+        matching: MatchingConfig = MatchingConfig(),
+        static_odds: MotionSegmentationConfig = MotionSegmentationConfig(),
+    ) -> None:
         self.camera = camera
+        self.pyramid = pyramid
+        self.config = config
+        self.matching = matching
+        self._static_odds = static_odds
         self.keyframes: list[Keyframe] = []
-        self.joined = 0
+        self.num_inserted = 0
         self._by_index: dict[int, Keyframe] = {}
         self._successors: dict[
             int, tuple[int, Array]
@@ -43,25 +46,26 @@ class Map:
         self.directions = np.zeros(
             (1024, 3)
         )  # sum of unit vectors from camera centres to the point
-        self.reach = np.zeros(
+        self.max_distance_m = np.zeros(
             1024
         )  # m: from further away not even the finest level shows the point
         self.num_observations = np.zeros(1024, dtype=np.int64)  # keyframes
-        self.observers = np.zeros(
-            (1024, _OBSERVERS), dtype=np.int32
-        )  # keyframe index + 1, 0 = none, in any order
+        # Keyframe index + 1, 0 = none, in any order; mostly the newest observers.
+        self.observers = np.zeros((1024, config.observers_per_point), dtype=np.int32)
         self.first_keyframe = np.zeros(1024, dtype=np.int64)  # keyframe index
         self.merged_into = np.full(1024, -1)  # the point that took over the one in this row
         self.visible = np.zeros(1024, dtype=np.int64)  # frames that should have seen it
         self.found = np.zeros(1024, dtype=np.int64)  # frames that did
-        self.moved = np.zeros(1024)  # log-odds against standing still, beyond those of a new point
+        self.moving_log_odds = np.zeros(
+            1024
+        )  # log-odds against standing still, beyond those of a new point
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe whose `point_ids` already name the points that were tracked in it."""
         self.keyframes.append(keyframe)
         self._by_index[keyframe.index] = keyframe
-        self.joined = keyframe.index + 1
-        self._add_observer(keyframe.seen_points(), keyframe)
+        self.num_inserted = keyframe.index + 1
+        self._add_observer(keyframe.observed_point_ids(), keyframe)
 
     def remove_keyframe(self, keyframe: Keyframe, successor: Keyframe) -> None:
         """Take out a keyframe; what hung on it, frames and points, hangs on another from now on,
@@ -91,22 +95,22 @@ class Map:
         keyframe, T = self.anchor(index)
         return np.asarray(T @ keyframe.T_cw)
 
-    def way(self) -> Array:
+    def keyframe_trajectory(self) -> Array:
         """[joined, 4, 4] T_wc, m, of all keyframes, removed ones too."""
-        return inverse(np.stack([self.pose(index) for index in range(self.joined)]))
+        return inverse(np.stack([self.pose(index) for index in range(self.num_inserted)]))
 
     def add_points(self, keyframe: Keyframe, keypoints: NDArray[np.int64]) -> None:
         """New points at the depth that was measured at corners of a keyframe."""
         features, count = keyframe.features, len(keypoints)
         ids = self._free_rows(count)
-        local = self.camera.backproject(features.points[keypoints], features.depths[keypoints])
+        local = self.camera.backproject(features.undistorted[keypoints], features.depths[keypoints])
         self.positions[ids] = (local - keyframe.T_cw[:3, 3]) @ keyframe.T_cw[:3, :3]
         self.descriptors[ids] = features.descriptors[keypoints]
-        self.reach[ids] = np.linalg.norm(local, axis=1) * SCALE ** features.octaves[keypoints]
+        self.max_distance_m[ids] = np.linalg.norm(local, axis=1) * features.scales[keypoints]
         self.first_keyframe[ids] = keyframe.index
         self.merged_into[ids] = -1
         self.directions[ids] = 0.0
-        self.moved[ids] = 0.0
+        self.moving_log_odds[ids] = 0.0
         self.visible[ids] = self.found[ids] = 1
         self.observe(keyframe, Matches(ids, keypoints))
 
@@ -114,9 +118,9 @@ class Map:
         """Corners of a keyframe, free so far, are measurements of points, held against none of
         their patches.
         """
-        keyframe.point_ids[matches.keypoints] = matches.points
-        keyframe.features.is_subpixel[matches.keypoints] = False
-        self._add_observer(matches.points, keyframe)
+        keyframe.point_ids[matches.keypoints] = matches.point_ids
+        keyframe.features = keyframe.features.marked_subpixel(matches.keypoints, False)
+        self._add_observer(matches.point_ids, keyframe)
 
     def forget(self, keyframe: Keyframe, keypoints: NDArray[np.int64]) -> None:
         """Corners of a keyframe are no measurements of their points."""
@@ -136,7 +140,7 @@ class Map:
         The log-odds of having moved become the larger of both: the same frames have judged them, so
         that their sum would count what a group did twice.
         """
-        np.maximum.at(self.moved, new, self.moved[old])
+        np.maximum.at(self.moving_log_odds, new, self.moving_log_odds[old])
         self.merged_into[old] = new
         alias = np.arange(self.size + 1)
         alias[old] = new
@@ -154,7 +158,7 @@ class Map:
             keep = keypoint[successors] == changed
             self.observe(keyframe, Matches(successors[keep], changed[keep]))
 
-    def current(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def resolve_merged(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """[n] what the points `ids` have become, by however many steps: themselves where none took
         them over.
         """
@@ -168,21 +172,29 @@ class Map:
                 return ids
             ids = np.where(taken, successors, ids)
 
-    def trust(self, ids: NDArray[np.int64]) -> Array:
+    def static_weight(self, ids: NDArray[np.int64]) -> Array:
         """[n] probability that each point stands still, as a share of a new point's: its weight,
         above 0 up to 1.
         """
-        return np.asarray((1 + np.exp(-_STILL)) / (1 + np.exp(self.moved[ids] - _STILL)))
+        prior = self._static_odds.static_log_odds
+        return np.asarray((1 + np.exp(-prior)) / (1 + np.exp(self.moving_log_odds[ids] - prior)))
 
     def measured(self, matches: Matches, features: Features) -> tuple[Array, Observations]:
         """Where the map has the matched points, [m, 3] m, and what a frame measured of them."""
-        seen = observations(features, matches.keypoints).trusted(self.trust(matches.points))
-        return self.positions[matches.points], seen
+        seen = observations(features, matches.keypoints).weighted(
+            self.static_weight(matches.point_ids)
+        )
+        return self.positions[matches.point_ids], seen
 
     def update_static_odds(self, still: NDArray[np.int64], moving: NDArray[np.int64]) -> None:
         """A frame has seen points stand still, and others move with a group that does not."""
-        self.moved[still] = np.maximum(self.moved[still] - _STOOD, 0.0)
-        self.moved[moving] = np.minimum(self.moved[moving] + _WENT, _CERTAIN)
+        odds = self._static_odds
+        self.moving_log_odds[still] = np.maximum(
+            self.moving_log_odds[still] - odds.static_step, 0.0
+        )
+        self.moving_log_odds[moving] = np.minimum(
+            self.moving_log_odds[moving] + odds.moving_step, odds.max_log_odds
+        )
 
     def shared(self, ids: NDArray[np.int64], keyframes: list[Keyframe]) -> NDArray[np.int64]:
         """[keyframes] how many of the points each of them sees."""
@@ -193,11 +205,12 @@ class Map:
     def covisible(self, ids: NDArray[np.int64], limit: int) -> list[Keyframe]:
         """Keyframes that see at least one of the points, those that see most first.
 
-        Only the 64 that occur most often among the points' observers are looked at, so that the
-        time this takes does not grow with the map.
+        Only those that occur most often among the points' observers are compared, so that the time
+        this takes does not grow with the map.
         """
         often = np.bincount(self.observers[ids].ravel(), minlength=1)[1:]
-        near = np.sort(np.argsort(-often, kind="stable")[:_NEIGHBORS])
+        num_candidates = self.config.covisibility_candidates
+        near = np.sort(np.argsort(-often, kind="stable")[:num_candidates])
         keyframes = [self._by_index[i] for i in near.tolist() if often[i] > 0]
         shared = self.shared(ids, keyframes)
         order = np.argsort(-shared, kind="stable")[:limit]
@@ -208,7 +221,7 @@ class Map:
 
         A point remembers a few of its observers; where it has more, all keyframes are returned.
         """
-        if (self.num_observations[ids] > _OBSERVERS).any():
+        if (self.num_observations[ids] > self.config.observers_per_point).any():
             return list(self.keyframes)
         return [self._by_index[i - 1] for i in np.unique(self.observers[ids]).tolist() if i > 0]
 
@@ -247,10 +260,11 @@ class Map:
     def project(self, ids: NDArray[np.int64], T_cw: Array) -> Projected:
         """The points among `ids` that a camera at T_cw should see."""
         camera, local = self.camera, to_local(T_cw, self.positions[ids])
-        z = np.maximum(local[:, 2], _NEAR)
+        near, num_levels = self.config.min_depth_m, self.pyramid.num_levels
+        z = np.maximum(local[:, 2], near)
         u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
         inside = (
-            (local[:, 2] > _NEAR) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+            (local[:, 2] > near) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         )
         ids, local = ids[inside], local[inside]
         distance = np.sqrt(np.einsum("nj,nj->n", local, local))
@@ -258,10 +272,13 @@ class Map:
         along = np.einsum(
             "nj,nj->n", local @ T_cw[:3, :3], sums
         )  # cosine times distance times length of the sum
-        level = np.log(np.maximum(self.reach[ids], 1e-9) / distance) / np.log(SCALE)
-        seen = along > _VIEW_COSINE * distance * np.sqrt(np.einsum("nj,nj->n", sums, sums))
-        seen &= (level > -1.0) & (level < LEVELS)
-        levels = np.clip(np.rint(level[seen]), 0, LEVELS - 1).astype(np.int64)
+        level = np.log(np.maximum(self.max_distance_m[ids], 1e-9) / distance) / np.log(
+            self.pyramid.factor
+        )
+        length = np.sqrt(np.einsum("nj,nj->n", sums, sums))
+        seen = along > self.matching.min_view_cosine * distance * length
+        seen &= (level > -1.0) & (level < num_levels)
+        levels = np.clip(np.rint(level[seen]), 0, num_levels - 1).astype(np.int64)
         pixels = np.stack([u[inside][seen], v[inside][seen]], axis=1)
         return Projected(ids[seen], pixels, levels, self.descriptors[ids[seen]])
 
@@ -290,9 +307,9 @@ class Map:
             "merged_into",
             "visible",
             "found",
-            "moved",
+            "moving_log_odds",
         )
-        names = ("positions", "descriptors", "directions", "reach", *counters)
+        names = ("positions", "descriptors", "directions", "max_distance_m", *counters)
         while len(self.positions) < count:
             for name in names:
                 array = getattr(self, name)

@@ -8,111 +8,100 @@ frame's pose as in bundle adjustment. We depart from eq. 9 in that A has four fr
 patch is taken for a plane that faced the first camera.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.keypoints import SCALE, Features
+from cohdc_train.slam.config import RefinementConfig
+from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.patch_alignment import (
-    MAX_LEVEL,
-    PATCH_PX,
-    TEMPLATE_PX,
-    Pyramid,
-    align,
-    warped,
-)
+from cohdc_train.slam.features.patch_alignment import Pyramid, align, warp_patches
 from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 
 
-@dataclass
 class PatchRefiner:
-    """Keeps the patches of a map's points, of all but the coarsest corners, and moves measurements
-    by them.
+    """Patches of a map's points, and the refinement of matched keypoints by them.
+
+    Points of the coarsest keypoints have no patch.
     """
 
-    world: Map
-
-    def __post_init__(self) -> None:
-        self._patches = np.zeros((0, PATCH_PX, PATCH_PX), dtype=np.uint8)
+    def __init__(self, point_map: Map, config: RefinementConfig) -> None:
+        self._map = point_map
+        self._config = config
+        self._patches = np.zeros((0, config.patch_px, config.patch_px), dtype=np.uint8)
         self._octaves = np.zeros(0, dtype=np.int64)
-        self._pyramid: Pyramid | None = None
 
-    def look_at(self, gray: NDArray[np.uint8]) -> None:
-        """The frame that is meant from now on, [H, W]."""
-        self._pyramid = Pyramid(gray)
+    def pyramid(self, gray: NDArray[np.uint8]) -> Pyramid:
+        """Return the image pyramid of a frame [H, W] that `store` and `refine` take."""
+        scale = self._map.pyramid
+        return Pyramid(gray, scale, min(self._config.max_level, scale.num_levels - 1))
 
-    def remember(self, keyframe: Keyframe) -> None:
-        """Cut out the points that were born in a keyframe, the newest in the map, made of the frame
-        looked at.
+    def store(self, keyframe: Keyframe, pyramid: Pyramid) -> None:
+        """Store the patches of the points created in a keyframe, the newest in the map.
+
+        pyramid: of the keyframe's image. The keypoints of these points are marked as refined.
         """
-        assert self._pyramid is not None
-        grown = len(self.world.positions) - len(
-            self._patches
-        )  # the map doubles its arrays, so this is rarely copied
-        if grown > 0:
-            self._patches = np.concatenate(
-                [self._patches, np.zeros((grown, PATCH_PX, PATCH_PX), dtype=np.uint8)]
-            )
-            self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
-        first_keyframe = np.flatnonzero(
-            self.world.first_keyframe[: len(self._patches)] == keyframe.index
-        )
-        self._patches[first_keyframe] = (
-            0  # blank, or a point without one would have that of the point whose row it took
-        )
-        keypoints = np.flatnonzero(
-            (keyframe.point_ids >= 0) & (keyframe.features.octaves <= MAX_LEVEL)
-        )
-        keypoints = keypoints[
-            self.world.first_keyframe[keyframe.point_ids[keypoints]] == keyframe.index
-        ]
+        self._reserve(len(self._map.positions))
+        side = self._config.patch_px
+        first_keyframe = self._map.first_keyframe
+        # Blank, or a point without a patch would have that of the point whose row it took.
+        self._patches[first_keyframe[: len(self._patches)] == keyframe.index] = 0
+
+        is_fine = keyframe.features.octaves <= self._config.max_level
+        keypoints = np.flatnonzero((keyframe.point_ids >= 0) & is_fine)
+        is_new = first_keyframe[keyframe.point_ids[keypoints]] == keyframe.index
+        keypoints = keypoints[is_new]
         ids, octaves = keyframe.point_ids[keypoints], keyframe.features.octaves[keypoints]
-        patches = self._pyramid.cut(keyframe.features.pixels[keypoints], octaves, PATCH_PX)
-        self._patches[ids] = np.rint(patches).reshape(-1, PATCH_PX, PATCH_PX)
+        patches = pyramid.cut(keyframe.features.pixels[keypoints], octaves, side)
+        self._patches[ids] = np.rint(patches).reshape(-1, side, side)
         self._octaves[ids] = octaves
-        keyframe.features.is_subpixel[keypoints] = (
-            True  # where the patch lies, by which others are moved
-        )
+        keyframe.features = keyframe.features.marked_subpixel(keypoints, True)
 
-    def refine(self, features: Features, matches: Matches, T_cw: Array) -> Features:
-        """The features with those matched corners moved that found a better place in the frame
-        looked at.
+    def refine(
+        self, features: Features, matches: Matches, T_cw: Array, pyramid: Pyramid
+    ) -> Features:
+        """Return the features with matched keypoints moved to where their patches fit better.
 
-        T_cw: [4, 4] the frame's pose.
+        T_cw: [4, 4] the frame's pose; pyramid: of the frame's image.
         """
-        assert self._pyramid is not None
-        matches = matches.take(features.octaves[matches.keypoints] <= MAX_LEVEL)
+        matches = matches.take(features.octaves[matches.keypoints] <= self._config.max_level)
         if len(matches) == 0:
             return features
-        ids, keypoints = matches.points, matches.keypoints
-        octaves = features.octaves[keypoints]
-        A = affine(self.world, ids, T_cw)
-        back = np.linalg.inv(A) * (SCALE ** (octaves - self._octaves[ids]))[:, None, None]
-        template = warped(self._patches[ids], back, TEMPLATE_PX + 2)
-        shift, good = align(self._pyramid, features.pixels[keypoints], octaves, template)
+        ids, keypoints = matches.point_ids, matches.keypoints
+        octaves, scale = features.octaves[keypoints], self._map.pyramid
+        A = affine(self._map, ids, T_cw)
+        back = np.linalg.inv(A) * scale.scales(octaves - self._octaves[ids])[:, None, None]
+        template = warp_patches(self._patches[ids], back, self._config.template_px + 2)
+        shift, good = align(pyramid, features.pixels[keypoints], octaves, template, self._config)
         rows = keypoints[good]
-        pixels, points = features.pixels.copy(), features.points.copy()
-        pixels[rows] += shift[good] * SCALE ** octaves[good, None]
-        undistort = (
-            self.world.camera.undistort
-        )  # the difference, for points may be unrolled (`shutter`)
-        points[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
+        pixels, undistorted = features.pixels.copy(), features.undistorted.copy()
+        pixels[rows] += shift[good] * scale.scales(octaves[good, None])
+        # The difference, for points may be corrected for the rolling shutter.
+        undistort = self._map.camera.undistort
+        undistorted[rows] += undistort(pixels[rows]) - undistort(features.pixels[rows])
         is_subpixel = np.zeros(len(features), dtype=np.bool_)
         is_subpixel[rows] = True
-        return replace(features, pixels=pixels, points=points, is_subpixel=is_subpixel)
+        return replace(features, pixels=pixels, undistorted=undistorted, is_subpixel=is_subpixel)
+
+    def _reserve(self, count: int) -> None:
+        """Make room for as many points as the map has, which doubles its arrays."""
+        grown = count - len(self._patches)
+        if grown > 0:
+            blank = np.zeros((grown, *self._patches.shape[1:]), dtype=np.uint8)
+            self._patches = np.concatenate([self._patches, blank])
+            self._octaves = np.concatenate([self._octaves, np.zeros(grown, dtype=np.int64)])
 
 
-def affine(world: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
+def affine(point_map: Map, ids: NDArray[np.int64], T_cw: Array) -> Array:
     """A of eq. 9 for n points: [n, 2, 2] px of a camera at T_cw per px of the keyframe where each
     was first seen.
     """
-    camera, points = world.camera, world.positions[ids]
-    first_keyframe, which = np.unique(world.first_keyframe[ids], return_inverse=True)
-    T_bw = np.stack([world.pose(index) for index in first_keyframe.tolist()])[which]
+    camera, points = point_map.camera, point_map.positions[ids]
+    first_keyframe, which = np.unique(point_map.first_keyframe[ids], return_inverse=True)
+    T_bw = np.stack([point_map.pose(index) for index in first_keyframe.tolist()])[which]
     depth = (
         np.einsum("nj,nj->n", T_bw[:, 2, :3], points) + T_bw[:, 2, 3]
     )  # in the keyframe of its birth

@@ -12,6 +12,7 @@ from scipy import sparse
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 from cohdc_train.slam.optimization.linear_solver import solve_symmetric
 from cohdc_train.slam.optimization.reprojection import (
+    MIN_DEPTH_M,
     Observations,
     ReprojectionModel,
     huber_weights,
@@ -75,7 +76,7 @@ def measurement_chi2(
     """[m] squared residual in sigmas; infinite where the point lies behind the camera."""
     local = local_points(poses, points, problem)
     error = residuals(local, problem.seen, reprojection)
-    return np.where(local[:, 2] > 0.05, np.einsum("mi,mi->m", error, error), np.inf)
+    return np.where(local[:, 2] > MIN_DEPTH_M, np.einsum("mi,mi->m", error, error), np.inf)
 
 
 def adjust(
@@ -118,7 +119,7 @@ def _cost(
     chi2 = np.einsum("mi,mi->m", error, error)
     if not robust:
         return float(chi2.sum())
-    limits = problem.seen.limits
+    limits = problem.seen.chi2_thresholds
     return float(np.where(chi2 <= limits, chi2, 2 * np.sqrt(limits * chi2) - limits).sum())
 
 
@@ -129,7 +130,9 @@ def _normal_equations(
     error = residuals(local, problem.seen, reprojection)
     derivative = residual_jacobian(local, problem.seen, reprojection)
     if robust:
-        weight = np.sqrt(huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.limits))
+        weight = np.sqrt(
+            huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.chi2_thresholds)
+        )
         error, derivative = error * weight[:, None], derivative * weight[:, None, None]
     by_pose = pose_jacobian(local, derivative)
     by_point = derivative @ poses[problem.cameras, :3, :3]

@@ -18,16 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.slam.config import LoopVerificationConfig
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, to_local
-
-_LEVELS = 2
-_STEPS = 20
-_EDGE = 0.05  # of the depth: a larger step between neighbours is an edge, whose pixels have no sure depth
-_SAME_DEPTH = 0.07  # of the depth: what lies further off is another surface
-_CLIP = 1.5  # robust sigmas
-_FEWEST = 200  # px that must be seen in both pictures
+from cohdc_train.slam.optimization.reprojection import MIN_DEPTH_M
 
 
 @dataclass(frozen=True)
@@ -49,23 +44,25 @@ class Alignment:
     agreement: float
 
 
-def align(of_map: DepthImage, local: DepthImage, T: Array) -> Alignment | None:
+def align(
+    of_map: DepthImage, local: DepthImage, T: Array, config: LoopVerificationConfig
+) -> Alignment | None:
     """Refine T: [4, 4] camera of the map's picture to camera of the local one, m; coarse to fine.
 
     Returns None when the pictures hardly overlap or there is nothing to hold on to.
     """
     pairs = [(of_map, local)]
-    for _ in range(_LEVELS - 1):
+    for _ in range(config.levels - 1):
         pairs.append((pairs[-1][0].half(), pairs[-1][1].half()))
-    levels = [(_Template(picture), other) for picture, other in pairs]
-    start = _compare(*levels[0], T)
+    levels = [(_Template(picture, config), other) for picture, other in pairs]
+    start = _compare(*levels[0], T, config)
     refined = T
     for template, other in reversed(levels):
-        found = _align_level(template, other, refined)
+        found = _align_level(template, other, refined, config)
         if found is None:
             return None
         refined = found
-    end = _compare(*levels[0], refined)
+    end = _compare(*levels[0], refined, config)
     if start is None or end is None:
         return None
     correlation = float(np.corrcoef(end.template, end.sampled)[0, 1])
@@ -75,10 +72,11 @@ def align(of_map: DepthImage, local: DepthImage, T: Array) -> Alignment | None:
 class _Template:
     """The map's picture, with the steepest-descent image of its usable pixels."""
 
-    def __init__(self, picture: DepthImage) -> None:
+    def __init__(self, picture: DepthImage, config: LoopVerificationConfig) -> None:
         camera, depth = picture.camera, picture.depth
         near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
-        usable: NDArray[np.bool_] = np.asarray((near > 0) & (far - near < _EDGE * depth))
+        max_step = config.max_depth_step_ratio * depth
+        usable: NDArray[np.bool_] = np.asarray((near > 0) & (far - near < max_step))
         usable[:, [0, -1]] = usable[[0, -1], :] = False
         rows, columns = np.nonzero(usable)
         pixels = np.stack([columns, rows], axis=1).astype(np.float64)
@@ -92,18 +90,27 @@ class _Template:
 
 
 def warp_jacobian(points: Array, camera: Camera) -> Array:
-    """dW/dp at p = 0. points: [x, 3] in the camera frame, m. Returns [x, 2, 6] px per (m, rad)."""
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    result = np.zeros((len(points), 2, 6))
-    result[:, 0, 0], result[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
-    result[:, 1, 1], result[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-    result[:, 0, 3:] = np.stack(
-        [-camera.fx * x * y / z**2, camera.fx * (1 + (x / z) ** 2), -camera.fx * y / z], axis=1
-    )
-    result[:, 1, 3:] = np.stack(
-        [-camera.fy * (1 + (y / z) ** 2), camera.fy * x * y / z**2, camera.fy * x / z], axis=1
-    )
-    return result
+    """Compute the derivative of the projection by the camera's motion, at zero (paper eq. 10).
+
+    u = fx x / z + cx, v = fy y / z + cy.
+
+    Args:
+        points: [n, 3] in the camera frame, m.
+        camera: pinhole camera.
+
+    Returns:
+        [n, 2, 6] px per (translation m, rotation rad).
+    """
+    x, y, z = points.T
+    fx, fy = camera.fx, camera.fy
+    zero = np.zeros_like(z)
+    du_dt = np.stack([fx / z, zero, -fx * x / z**2], axis=1)
+    dv_dt = np.stack([zero, fy / z, -fy * y / z**2], axis=1)
+    du_dr = np.stack([-fx * x * y / z**2, fx * (1 + (x / z) ** 2), -fx * y / z], axis=1)
+    dv_dr = np.stack([-fy * (1 + (y / z) ** 2), fy * x * y / z**2, fy * x / z], axis=1)
+    du = np.concatenate([du_dt, du_dr], axis=1)
+    dv = np.concatenate([dv_dt, dv_dr], axis=1)
+    return np.stack([du, dv], axis=1)
 
 
 @dataclass(frozen=True)
@@ -124,20 +131,22 @@ class _Comparison:
     agreement: float
 
 
-def _compare(template: _Template, local: DepthImage, T: Array) -> _Comparison | None:
+def _compare(
+    template: _Template, local: DepthImage, T: Array, config: LoopVerificationConfig
+) -> _Comparison | None:
     carried = to_local(T, template.points)
-    z = np.maximum(carried[:, 2], 0.05)
+    z = np.maximum(carried[:, 2], MIN_DEPTH_M)
     pixels = local.camera.project(np.column_stack([carried[:, :2], z]))
     there = _sample(local.depth, pixels, cv2.INTER_NEAREST)
     with_reading = there > 0
-    seen = np.asarray(with_reading & (np.abs(there - z) < _SAME_DEPTH * z))
-    if seen.sum() < _FEWEST:
+    seen = np.asarray(with_reading & (np.abs(there - z) < config.same_depth_ratio * z))
+    if seen.sum() < config.min_pixels:
         return None
     sampled, values = _sample(local.gray, pixels[seen], cv2.INTER_LINEAR), template.values[seen]
     spread = float(values.std()) + 1e-6
     sampled = (sampled - sampled.mean()) * (spread / (sampled.std() + 1e-6)) + values.mean()
     residual = sampled - values
-    limit = _CLIP * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+    limit = config.clip_sigma * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
     error = float(np.minimum(np.abs(residual), spread).mean()) / spread
     share = float(seen.sum())
     residual = np.clip(residual, -limit, limit)
@@ -153,9 +162,11 @@ def _sample(image: NDArray[np.float32], pixels: Array, interpolation: int) -> Ar
     return np.asarray(found[0], dtype=np.float64)
 
 
-def _align_level(template: _Template, local: DepthImage, T: Array) -> Array | None:
-    for _ in range(_STEPS):
-        now = _compare(template, local, T)
+def _align_level(
+    template: _Template, local: DepthImage, T: Array, config: LoopVerificationConfig
+) -> Array | None:
+    for _ in range(config.iterations):
+        now = _compare(template, local, T, config)
         if now is None:
             return None
         descent = template.descent[now.seen]

@@ -39,7 +39,7 @@ def optimize_pose(
     was expected, which counts beside the measurements. Returns the pose and [m] bool, True = inlier
     at 95 %.
     """
-    limits = seen.limits
+    limits = seen.chi2_thresholds
     used = np.ones(len(points), dtype=np.bool_)
     for _ in range(rounds):
         if used.sum() >= 6:
@@ -69,7 +69,7 @@ def _refine(
     prior: Prior | None,
     steps: int = 8,
 ) -> Array:
-    limits = seen.limits
+    limits = seen.chi2_thresholds
     J = np.zeros((6, 3, len(points)))
     for _ in range(steps):
         local = to_local(T_cw, points)
@@ -80,7 +80,7 @@ def _refine(
         rows, weighted = J.reshape(6, -1), (J * weight).reshape(6, -1)
         H, g = weighted @ rows.T + 1e-9 * np.eye(6), weighted @ error.reshape(-1)
         if prior is not None:
-            H, g = H + prior.information, g + prior.pull(T_cw)
+            H, g = H + prior.information, g + prior.gradient(T_cw)
         step = np.linalg.solve(H, -g)
         turn = np.asarray(cv2.Rodrigues(step[3:])[0])
         T_cw = T_cw.copy()

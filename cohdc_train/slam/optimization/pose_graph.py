@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from cohdc_train.slam.config import LoopConfig
 from cohdc_train.slam.geometry.se3 import (
     Array,
     adjoint,
@@ -20,10 +21,6 @@ from cohdc_train.slam.geometry.se3 import (
     log_se3,
 )
 from cohdc_train.slam.optimization.linear_solver import solve_symmetric
-
-_ROUNDS = 6  # in which the kernel narrows
-_STEPS = 4  # per round
-_WIDTH = 3.0  # sigmas at which a robust edge has lost half its weight
 
 
 @dataclass(frozen=True)
@@ -67,18 +64,19 @@ def edge_jacobians(poses: Array, edges: Edges) -> tuple[Array, Array]:
     return first, second
 
 
-def optimize_graph(poses: Array, edges: Edges) -> tuple[Array, Array]:
+def optimize_graph(poses: Array, edges: Edges, config: LoopConfig) -> tuple[Array, Array]:
     """Levenberg-Marquardt on all poses but node 0, which holds still and must be connected with
     every other.
 
     poses: [n, 4, 4] T_cw. The Cauchy kernel of the robust edges begins so wide that each has at
-    least half its weight and narrows to 3 sigmas, so that a right loop pulls from the start and a
+    least half its weight and narrows to config.cauchy_width, so that a right loop pulls from the start and a
     wrong one lets go. Returns the poses and [e] the weight 0..1 each edge ended with.
     """
-    width = _squared(poses, edges)[edges.robust].max(initial=_WIDTH**2)
-    for width2 in np.geomspace(width, _WIDTH**2, _ROUNDS):
-        poses = _descend(poses, edges, width2)
-    return poses, _weights(_squared(poses, edges), edges, _WIDTH**2)
+    final = config.cauchy_width**2
+    start = _squared(poses, edges)[edges.robust].max(initial=final)
+    for width2 in np.geomspace(start, final, config.graph_rounds):
+        poses = _descend(poses, edges, width2, config.graph_steps)
+    return poses, _weights(_squared(poses, edges), edges, final)
 
 
 def _squared(poses: Array, edges: Edges) -> Array:
@@ -94,10 +92,10 @@ def _cost(squared: Array, edges: Edges, width2: float) -> float:
     return float(np.where(edges.robust, width2 * np.log1p(squared / width2), squared).sum())
 
 
-def _descend(poses: Array, edges: Edges, width2: float) -> Array:
+def _descend(poses: Array, edges: Edges, width2: float, steps: int) -> Array:
     damping = 1e-6
     squared = _squared(poses, edges)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         step = _solve(poses, edges, _weights(squared, edges, width2), damping)
         moved = poses.copy()
         moved[1:] = exp_se3(step) @ poses[1:]

@@ -41,7 +41,7 @@ class Observations:
             self.pixels[rows], self.depths[rows], self.sigmas[rows], self.depth_sigmas[rows]
         )
 
-    def trusted(self, trust: Array) -> "Observations":
+    def weighted(self, trust: Array) -> "Observations":
         """The same of points that stand still with these probabilities, [m] above 0 up to 1: they
         weigh as much.
         """
@@ -51,12 +51,12 @@ class Observations:
         )
 
     @property
-    def limits(self) -> Array:
+    def chi2_thresholds(self) -> Array:
         """[m] chi-square above which a measurement is an outlier at 5 %."""
         return np.where(np.isnan(self.depths), CHI2_PIXEL, CHI2_DEPTH)
 
 
-def joined(parts: list[Observations]) -> Observations:
+def concatenate(parts: list[Observations]) -> Observations:
     """All measurements of some frames, in their order."""
     return Observations(
         np.concatenate([part.pixels for part in parts]),
@@ -85,7 +85,7 @@ class Prior:
     T_cw: Array
     information: Array
 
-    def pull(self, T_cw: Array) -> Array:
+    def gradient(self, T_cw: Array) -> Array:
         """[6] gradient, at T_cw, of half the squared distance in sigmas; to first order in the
         rotation between.
         """

@@ -1,61 +1,82 @@
-"""A trajectory after the fact: where each frame was by what it saw, what those around it saw, and
-how a hand moves.
+"""Smoothing of a trajectory by the motion model, when the sequence is over.
 
-The fixed-interval counterpart of `motion`: velocity changes as there, unless it is seen to change
-faster, but frames that come later count as well. All poses are found at once.
+The fixed-interval counterpart of the motion model: velocity changes as there, unless it is seen to
+change faster, but later frames count as well. All poses are solved for at once.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
-from cohdc_train.slam.config import ACCELERATION, LONGEST, SHORTEST
+from cohdc_train.slam.config import MotionModelConfig, SmoothingConfig
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
 
-_SHARED = 2e-3  # m and rad: error of a frame that its information does not know of
-_LEAST = 1.0  # 1/m^2 and 1/rad^2: information of a frame that saw nothing
-_LEAST_SHARE = 0.01  # of the variance that frames claim, which is left to them at least
-_AROUND = 15  # frames on either side, over which the camera is held to be as calm or as shaken
-_ROUNDS = 3  # of finding out how shaken it is
 _BAND = 18  # diagonals of the normal equations: three frames hang together
 
 
-def smoothed(stamps: Array, poses: Array, information: Array, pulls: Array) -> Array:
-    """stamps: [n] s, rising; poses: [n, 4, 4] T_cw world to camera, m; information: [n, 6, 6]
-    inverse covariance of each by what it saw, in the camera's frame, (m, rad); pulls: [n, 6]
-    `Prior.pull` of what was expected when the pose was found, 0 where nothing was: it is taken out,
-    for what came before counts here anyway. Returns [n, 4, 4] T_cw.
+@dataclass(frozen=True)
+class TrackedPoses:
+    """Poses of n frames, and what each frame knows of its own.
 
-    Frames further apart than LONGEST have nothing to do with each other.
+    timestamps: [n] s, rising; T_cw: [n, 4, 4] world to camera, m; information: [n, 6, 6] inverse
+    covariance of each pose by the frame's measurements, in the camera's frame, (m, rad);
+    prior_gradients: [n, 6] `Prior.gradient` of the motion prior at each pose, 0 where none counted.
     """
-    step = np.diff(stamps)
-    ends = np.flatnonzero((step <= SHORTEST) | (step > LONGEST)) + 1
-    runs = [np.split(values, ends) for values in (stamps, poses, information, pulls)]
-    return np.concatenate([_smoothed_run(*run) for run in zip(*runs, strict=True)])
+
+    timestamps: Array
+    T_cw: Array
+    information: Array
+    prior_gradients: Array
+
+    def split(self, rows: NDArray[np.int64]) -> list["TrackedPoses"]:
+        """Split before the given rows."""
+        parts = [
+            np.split(values, rows)
+            for values in (self.timestamps, self.T_cw, self.information, self.prior_gradients)
+        ]
+        return [TrackedPoses(*part) for part in zip(*parts, strict=True)]
 
 
-def _smoothed_run(stamps: Array, poses: Array, information: Array, pulls: Array) -> Array:
-    """The same of frames that follow closely upon each other."""
-    if len(stamps) < 3:
+def smooth_trajectory(
+    tracked: TrackedPoses, config: SmoothingConfig, motion: MotionModelConfig
+) -> Array:
+    """Return smoothed poses [n, 4, 4] T_cw, m.
+
+    The motion prior that a pose was found with is taken out, for what came before counts here
+    anyway. Frames further apart than motion.max_gap_s are smoothed separately.
+    """
+    step = np.diff(tracked.timestamps)
+    is_gap = (step <= motion.min_gap_s) | (step > motion.max_gap_s)
+    runs = tracked.split(np.flatnonzero(is_gap) + 1)
+    return np.concatenate([_smooth_run(run, config, motion) for run in runs])
+
+
+def _smooth_run(tracked: TrackedPoses, config: SmoothingConfig, motion: MotionModelConfig) -> Array:
+    """Smooth frames without a gap between them."""
+    timestamps, poses = tracked.timestamps, tracked.T_cw
+    if len(timestamps) < 3:
         return poses
-    before, after = np.diff(stamps)[:-1], np.diff(stamps)[1:]
+    before, after = np.diff(timestamps)[:-1], np.diff(timestamps)[1:]
     shares = np.stack([1 / before, -1 / before - 1 / after, 1 / after])[..., None]
-    deviation = ACCELERATION * ((before + after) / 2)[:, None]
+    deviation = np.repeat(motion.acceleration_sigma, 3) * ((before + after) / 2)[:, None]
     motions = log_se3(poses[1:] @ inverse(poses[:-1]))
     change = motions[1:] / after[:, None] - motions[:-1] / before[:, None]
-    certain, axes = np.linalg.eigh(information)
-    certain = np.maximum(certain, _LEAST)
-    away = np.einsum("nab,nb,ncb,nc->na", axes, 1 / certain, axes, pulls)
-    seen = (axes * (certain / (1 + certain * _SHARED**2))[:, None]) @ axes.transpose(0, 2, 1)
-    seen = seen * _sharper(seen, shares, change, deviation)
+    certain, axes = np.linalg.eigh(tracked.information)
+    certain = np.maximum(certain, config.min_information)
+    away = np.einsum("nab,nb,ncb,nc->na", axes, 1 / certain, axes, tracked.prior_gradients)
+    weights = certain / (1 + certain * config.pose_floor**2)
+    seen = (axes * weights[:, None]) @ axes.transpose(0, 2, 1)
+    seen = seen * _sharper(seen, shares, change, deviation, config.min_variance_ratio)
     towards = np.einsum("nab,nb->na", seen, away)
-    weight, small = np.ones_like(change), np.zeros((len(stamps), 6))
-    for _ in range(_ROUNDS):
+    weight, small = np.ones_like(change), np.zeros((len(timestamps), 6))
+    for _ in range(config.iterations):
         small = _solved(seen, towards, shares, change, weight / deviation**2)
         left = (change + (shares * np.stack(_threes(small))).sum(axis=0)) / deviation
-        weight = 1 / np.maximum(
-            1.0, uniform_filter1d(left**2, 2 * _AROUND + 1, axis=0, mode="nearest")
-        )
+        window = 2 * config.window_frames + 1
+        weight = 1 / np.maximum(1.0, uniform_filter1d(left**2, window, axis=0, mode="nearest"))
     return np.asarray(exp_se3(small) @ poses, dtype=np.float64)
 
 
@@ -66,15 +87,16 @@ def _threes(values: Array) -> tuple[Array, Array, Array]:
     return values[:-2], values[1:-1], values[2:]
 
 
-def _sharper(seen: Array, shares: Array, change: Array, deviation: Array) -> Array:
+def _sharper(
+    seen: Array, shares: Array, change: Array, deviation: Array, min_ratio: float
+) -> Array:
     """[6, 6] how much more frames know than they say: with so much noise velocity would change more
     than it does.
     """
     own = np.diagonal(np.linalg.inv(seen), axis1=1, axis2=2)
     foreseen = (shares**2 * np.stack(_threes(own))).sum(axis=0).mean(axis=0)
-    share = np.clip(
-        ((change**2).mean(axis=0) - (deviation**2).mean(axis=0)) / foreseen, _LEAST_SHARE, 1.0
-    )
+    excess = (change**2).mean(axis=0) - (deviation**2).mean(axis=0)
+    share = np.clip(excess / foreseen, min_ratio, 1.0)
     return np.asarray(1 / np.sqrt(share[:, None] * share[None]))
 
 

@@ -1,1 +1,1 @@
-"""Threads, processes and pace."""
+"""Real time: threads, processes, and the pace of frames."""

@@ -10,36 +10,41 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-NICE = 15  # a worker gives way to tracking when there are fewer cores than work
+from cohdc_train.slam.config import RealtimeConfig
 
 
 @contextmanager
-def worker_process() -> Iterator[Executor]:
-    """One process of one thread, ready to work, that gives way to its parent and leaves Ctrl-C to
-    it.
+def worker_process(config: RealtimeConfig = RealtimeConfig()) -> Iterator[Executor]:
+    """Run one worker process with one thread, until the `with` block ends.
+
+    The worker yields to its parent where there are fewer cores than work, and leaves Ctrl-C to it.
+
+    Args:
+        config: niceness of the process.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as executor:
-        executor.submit(_begin).result()
+        executor.submit(_set_up, config.worker_nice).result()
         yield executor
 
 
-def _begin() -> None:
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # a terminal sends it to the whole group; the parent ends this process
-    import scipy.linalg  # noqa: F401  with numpy's: the limit only reaches libraries that are loaded
+def _set_up(nice: int) -> None:
+    """Set up the worker process."""
+    # A terminal sends Ctrl-C to the whole group; the parent ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # With NumPy's: the limit only reaches libraries that are loaded.
+    import scipy.linalg  # noqa: F401
 
     threadpool_limits(1, "blas")
     if hasattr(os, "nice"):
-        os.nice(NICE)
+        os.nice(nice)
 
 
 class SynchronousExecutor(Executor):
-    """Executor that works when a job is submitted, so that results do not depend on time."""
+    """Executor that runs a job when it is submitted, so that results do not depend on time."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return a finished future."""
+        """Run a job. Returns a finished future."""
         future: Future[Any] = Future()
         future.set_result(fn(*args, **kwargs))
         return future

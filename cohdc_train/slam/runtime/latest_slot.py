@@ -1,4 +1,4 @@
-"""The hand-over between two threads that never queues: one slot, and the newest wins."""
+"""Handover between two threads without a queue: one slot, and the newest item wins."""
 
 import threading
 from typing import Generic, TypeVar
@@ -7,9 +7,14 @@ T = TypeVar("T")
 
 
 class LatestSlot(Generic[T]):
-    """Holds one item at most. What a newer one replaces before it was taken is dropped and counted."""
+    """Slot for one item; a newer item replaces one that nobody has taken yet.
+
+    Attributes:
+        dropped: number of items that were replaced.
+    """
 
     def __init__(self) -> None:
+        """Start empty and open."""
         self._changed = threading.Condition()
         self._item: T | None = None
         self._closed = False
@@ -17,32 +22,36 @@ class LatestSlot(Generic[T]):
         self.dropped = 0
 
     def put(self, item: T) -> None:
-        """Replace what is there."""
+        """Put an item into the slot."""
         with self._changed:
             self.dropped += self._item is not None
             self._item = item
             self._changed.notify()
 
     def take(self) -> T | None:
-        """Wait for an item. Returns None once the slot is closed and empty; raises the error it was
-        closed with.
+        """Wait for an item and take it.
+
+        Returns:
+            None when the slot is closed and empty; an error it was closed with is raised.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None or self._closed)
             return self._pop()
 
     def poll(self) -> T | None:
-        """The item if there is one, without waiting; raises the error the slot was closed with."""
+        """Take the item if there is one, without waiting; raises the error of `close`."""
         with self._changed:
             return self._pop()
 
     def close(self, error: Exception | None = None) -> None:
-        """No item will follow; `error` is raised where the next one would have been taken."""
+        """Close the slot. error: raised where the next item would have been taken."""
         with self._changed:
-            self._closed, self._error = True, error
+            self._closed = True
+            self._error = error
             self._changed.notify()
 
     def _pop(self) -> T | None:
+        """Take the item, or raise the error of a closed slot."""
         item, self._item = self._item, None
         if item is None and self._error is not None:
             raise self._error

@@ -1,5 +1,4 @@
-"""OpenCV and linear algebra on one thread: the order of their sums cannot change from run to run or
-with the number of cores, and no thread of theirs spins where the segmenter works."""
+"""Numerical libraries on one thread, so that results repeat and cores stay free."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,11 +8,12 @@ from threadpoolctl import threadpool_limits
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """For a `with` block; with a fixed seed of OpenCV's random numbers.
+def single_threaded() -> Iterator[None]:
+    """Limit OpenCV and linear algebra to one thread in a `with` block, and fix OpenCV's seed.
 
-    Both are the whole process's: of two blocks at once the one that ends first takes the other's
-    limit with it.
+    Sums then have the same order on any machine, and no idle thread spins where the segmenter
+    works. The limits are those of the process: of two blocks at the same time, the one that ends
+    first ends the other's limit.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

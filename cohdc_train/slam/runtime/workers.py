@@ -1,6 +1,4 @@
-"""What runs beside tracking in real time: the source at its own pace, the segmenter, local bundle
-adjustment.
-"""
+"""Parts of a real-time run that work in parallel with tracking."""
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -10,61 +8,88 @@ from typing import Any
 
 import numpy as np
 
+from cohdc_train.slam.config import MaskConfig, RealtimeConfig
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, MaskSource, SegmenterMasks, no_masks
-from cohdc_train.slam.frame import Pose, PoseCallback
+from cohdc_train.slam.frame import FrameResult, PoseCallback
 from cohdc_train.slam.io.results import quantiles
-from cohdc_train.slam.io.sources import Source
-from cohdc_train.slam.runtime.async_masks import AsyncMasks
+from cohdc_train.slam.io.sources import FrameSource
+from cohdc_train.slam.runtime.async_masks import AsyncSegmenter
 from cohdc_train.slam.runtime.executors import worker_process
 from cohdc_train.slam.runtime.paced_source import PacedSource
 
 
 @dataclass(frozen=True)
-class Workers:
-    """The parts of a run that others wait for no longer. masks: None when nothing is masked."""
+class RealtimeWorkers:
+    """Paced source, segmenter and worker process of a real-time run.
+
+    Attributes:
+        source: frames at their pace.
+        masks: segmenter in a thread; None without masks.
+        executor: worker process for bundle adjustment.
+    """
 
     source: PacedSource
-    masks: AsyncMasks | None
+    masks: AsyncSegmenter | None
     executor: Executor
 
     @property
     def mask_of(self) -> MaskSource:
-        """Every frame's mask."""
+        """Source of the mask of each frame."""
         return self.masks or no_masks
 
-    def answering(self, on_pose: PoseCallback | None) -> PoseCallback:
-        """The same, after the source has learnt that there is an answer."""
+    def report_latency(self, on_pose: PoseCallback | None) -> PoseCallback:
+        """Return a callback that records the latency of a pose, and then calls `on_pose`."""
 
-        def answered(pose: Pose) -> None:
-            self.source.answered()
+        def record(result: FrameResult) -> None:
+            self.source.mark_answered()
             if on_pose is not None:
-                on_pose(pose)
+                on_pose(result)
 
-        return answered
+        return record
 
     def metrics(self) -> dict[str, Any]:
-        """How the run kept up: p50 and p95, ms, of `latency` (from a frame's stamp until its pose
-        was known), of the masks' `age`, and of the `segmenter`, for which nobody waited; how many
-        frames were `dropped`; by how many seconds playing fell `behind` the recording."""
-        result: dict[str, Any] = {
+        """Return how the run kept pace.
+
+        Returns:
+            Number of frames `dropped`; `behind_s`, the delay of playback; p50 and p95, ms, of
+            `latency_ms` (from a frame's timestamp until its pose was known), `mask_age_ms`, and
+            `segmenter_ms`, for which no frame waits.
+        """
+        metrics: dict[str, Any] = {
             "dropped": self.source.dropped,
-            "behind_s": self.source.behind,
-            "latency_ms": _milliseconds(self.source.latencies),
+            "behind_s": self.source.playback_delay_s,
+            "latency_ms": _quantiles_ms(self.source.latencies),
         }
         if self.masks is not None:
-            result["mask_age_ms"] = _milliseconds(self.masks.ages)
-            result["segmenter_ms"] = quantiles(self.masks.segment_ms)
-        return result
+            metrics["mask_age_ms"] = _quantiles_ms(self.masks.ages)
+            metrics["segmenter_ms"] = quantiles(self.masks.segment_ms)
+        return metrics
 
 
 @contextmanager
-def workers(source: Source, masks: MaskFolder | SegmenterMasks | None) -> Iterator[Workers]:
-    """Start them; when the block ends, they end."""
+def start_workers(
+    source: FrameSource,
+    masks: MaskFolder | SegmenterMasks | None,
+    mask_config: MaskConfig = MaskConfig(),
+    realtime: RealtimeConfig = RealtimeConfig(),
+) -> Iterator[RealtimeWorkers]:
+    """Start the workers; they end with the `with` block.
+
+    Args:
+        source: of the frames.
+        masks: of the frames, or None.
+        mask_config: propagation of masks.
+        realtime: niceness of the workers.
+    """
     with ExitStack() as stack:
-        executor = stack.enter_context(worker_process())
-        beside = None if masks is None else stack.enter_context(AsyncMasks(masks.outline))
-        yield Workers(stack.enter_context(PacedSource(source)), beside, executor)
+        executor = stack.enter_context(worker_process(realtime))
+        segmenter = None
+        if masks is not None:
+            segmenter = stack.enter_context(AsyncSegmenter(masks.segment, mask_config, realtime))
+        paced = stack.enter_context(PacedSource(source))
+        yield RealtimeWorkers(paced, segmenter, executor)
 
 
-def _milliseconds(seconds: list[float]) -> dict[str, float]:
+def _quantiles_ms(seconds: list[float]) -> dict[str, float]:
+    """Return p50 and p95, ms, of times in s."""
     return quantiles((1e3 * np.array(seconds)).tolist())

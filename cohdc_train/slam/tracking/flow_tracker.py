@@ -1,9 +1,8 @@
-"""A frame's pose at once, before it is matched against the map or without: optical flow finds the
-points that the last matched one saw.
+"""Optical-flow tracking of the frames between two that are matched with the map.
 
-Corners, descriptors and the search for both take most of a frame's time. A thirtieth of a second
-later the same points are a few pixels on, and the patch around each says where. Flow starts from
-the matched frame every time, never from a frame that was itself tracked by it, so that nothing adds
+Keypoints, descriptors, and the search for both take most of a frame's time. A thirtieth of a second
+later the same points are a few pixels away, and the patch around each says where. Flow starts from
+the matched frame every time, never from a frame that flow tracked itself, so that errors do not add
 up.
 """
 
@@ -13,178 +12,230 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.slam.features.keypoints import Features, Keypoints
+from cohdc_train.slam.config import FlowConfig
+from cohdc_train.slam.features.keypoints import Keypoints
 from cohdc_train.slam.features.matching import Matches
 from cohdc_train.slam.features.orb import gray_of
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, to_local
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
-from cohdc_train.slam.optimization.reprojection import ReprojectionModel
-from cohdc_train.slam.tracking.localizer import Fit
+from cohdc_train.slam.optimization.reprojection import MIN_DEPTH_M, ReprojectionModel
+from cohdc_train.slam.tracking.frame_measurer import FrameMeasurer
 from cohdc_train.slam.tracking.motion_model import Prediction
-
-_BETWEEN = 2  # frames in a row: ten times a second the map is consulted
-_AT_MOST = 5  # while there is no time for more
-_WINDOW = (13, 13)  # px of a patch
-_LEVELS = 2  # of the image pyramid above the image itself
-_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
-_MANY = 500  # points, of which a frame follows only
-_TURNS = 2  # every second, the next one the others: a pose needs no more, and most of the time goes into them
-_LEAST = 50  # points that agree on a pose
-_SHARE = 0.4  # of the points that set out, that agree on a pose
-_MUCH_HAS_CHANGED = 0.6  # of them: where fewer agree, the frame is to be matched
-_NEAR = 0.05  # m
+from cohdc_train.slam.tracking.pose_estimate import FrameFeatures, PoseEstimate
 
 
 @dataclass(frozen=True)
-class _Start:
-    """A matched frame.
+class FlowState:
+    """A matched frame that flow starts from, and the latest frame tracked from it.
 
-    gray: [H, W] uint8; ids: [m] int64 points that are matched; corners: where, m of them; off: [m,
-    2] px by which each lies beside its point's projection; masked: [m] bool, it was matched though
-    a mask was given for it; reference: the keyframe that sees most of the points.
+    gray: [H, W] uint8; point_ids: [m] int64 matched map points; keypoints: m of them; offsets: [m,
+    2] px from a point's projection to its keypoint; under_mask: [m] bool, matched although masked;
+    reference: the keyframe that observes most of the points; num_frames: tracked from here;
+    num_started: points tracked in the latest frame; num_agreeing: those that agreed on its pose.
     """
 
     gray: NDArray[np.uint8]
-    ids: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
     keypoints: Keypoints
-    off: Array
-    masked: NDArray[np.bool_]
+    offsets: Array
+    under_mask: NDArray[np.bool_]
     reference: Keyframe | None
+    num_frames: int = 0
+    num_started: int = 0
+    num_agreeing: int = 0
 
-    def take(self, rows: NDArray[np.int64]) -> "_Start":
-        """The same with the chosen points."""
-        ids, keypoints = self.ids[rows], self.keypoints.take(rows)
+    @property
+    def tracked_ratio(self) -> float:
+        """Share of the points on which the latest pose rests: a view that changes loses them."""
+        return self.num_agreeing / self.num_started
+
+    def take(self, rows: NDArray[np.int64]) -> "FlowState":
+        """Return the state with the chosen points."""
         return replace(
-            self, ids=ids, keypoints=keypoints, off=self.off[rows], masked=self.masked[rows]
+            self,
+            point_ids=self.point_ids[rows],
+            keypoints=self.keypoints.take(rows),
+            offsets=self.offsets[rows],
+            under_mask=self.under_mask[rows],
         )
 
 
 @dataclass(frozen=True)
-class Followed:
-    """Points that flow found. ids: [m] int64, of the map; corners: where they are, m of them."""
+class FlowTracks:
+    """Points that flow tracked into a frame. point_ids: [m] int64; keypoints: where, m of them."""
 
-    ids: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
     keypoints: Keypoints
 
 
 class FlowTracker:
-    """The poses of the frames after a matched one, without corners of their own."""
+    """Poses of the frames after a matched one, without keypoints of their own."""
 
-    def __init__(self, world: Map, reprojection: ReprojectionModel) -> None:
-        self.map = world
+    def __init__(
+        self,
+        point_map: Map,
+        reprojection: ReprojectionModel,
+        measurer: FrameMeasurer,
+        config: FlowConfig = FlowConfig(),
+    ) -> None:
+        self.map = point_map
         self._reprojection = reprojection
-        self._start: _Start | None = None
-        self._followed = 0
-        self._set_out = self._agree = 0  # points
+        self._measurer = measurer
+        self._config = config
 
-    def begin(
+    def start(
+        self, rgb: NDArray[np.uint8], estimate: PoseEstimate, mask: NDArray[np.bool_] | None
+    ) -> FlowState | None:
+        """Return the state of a matched frame, None where it has too few matches.
+
+        mask: [H, W] bool, as given. What was matched under it, because it is static, may be tracked
+        there.
+        """
+        if len(estimate.matches) < self._config.min_inliers:
+            return None
+        ids = estimate.matches.point_ids
+        keypoints = estimate.features.keypoints(estimate.matches.keypoints)
+        offsets = keypoints.pixels - self._project(estimate.T_cw, ids)
+        under_mask = _is_covered(keypoints.pixels, mask)
+        gray = gray_of(rgb)
+        return FlowState(gray, ids, keypoints, offsets, under_mask, estimate.reference)
+
+    def track(
+        self,
+        frame: RGBDFrame,
+        mask: NDArray[np.bool_] | None,
+        state: FlowState,
+        prediction: Prediction,
+    ) -> tuple[PoseEstimate | None, FlowState]:
+        """Return the frame's pose, None where too few points agree, and the state after it.
+
+        mask: [H, W] bool, True = dynamic: no point is tracked there.
+        """
+        tracks, state = self.track_points(frame.rgb, mask, state, prediction.prior.T_cw)
+        features = self._measurer.measure(tracks.keypoints, frame, mask)
+        return self.estimate_pose(tracks, FrameFeatures(features, mask), state, prediction)
+
+    def track_points(
         self,
         rgb: NDArray[np.uint8],
-        features: Features,
-        fit: Fit | None,
         mask: NDArray[np.bool_] | None,
-    ) -> None:
-        """A frame has been matched: what it sees is followed from now on.
+        state: FlowState,
+        T_cw: Array,
+    ) -> tuple[FlowTracks, FlowState]:
+        """Track the points into the next frame. T_cw: [4, 4] predicted pose."""
+        config = self._config
+        num_frames = state.num_frames + 1
+        start = state
+        if len(state.point_ids) >= config.subsample_above:  # in turns: a pose needs no more
+            turn = num_frames % config.subsample
+            start = state.take(np.flatnonzero(state.point_ids % config.subsample == turn))
+        num_started = len(start.point_ids)
 
-        fit: None when the place is lost; mask: [H, W] bool, as it was given. What has been matched
-        under it all the same, because it is at rest, may be followed there.
-        """
-        self._start, self._followed = None, 0
-        if fit is None or len(fit.matches) < _LEAST:
-            return
-        rows = fit.matches.keypoints
-        keypoints = features.keypoints(rows)
-        off = keypoints.pixels - self._seen_from(fit.T_cw, fit.matches.points)
-        masked = _covered(keypoints.pixels, mask)
-        self._start = _Start(
-            gray_of(rgb), fit.matches.points, keypoints, off, masked, fit.reference
-        )
+        pixels, is_found = self._flow(start, gray_of(rgb), T_cw)
+        rows = np.flatnonzero(is_found & _is_inside(pixels, self.map.camera))
+        rows = rows[start.under_mask[rows] | ~_is_covered(pixels[rows], mask)]
 
-    def follow(
-        self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None, T_cw: Array
-    ) -> Followed | None:
-        """Look for the points in the next frame; None when there is nothing to look for.
+        # Points may have been merged since: each is tracked once, and a merged one is not refined.
+        known = start.point_ids[rows]
+        ids, first = np.unique(self.map.resolve_merged(known), return_index=True)
+        rows, is_same = rows[first], ids == known[first]
+        keypoints = start.keypoints.take(rows)
+        is_subpixel = keypoints.is_subpixel & is_same
+        tracks = FlowTracks(ids, replace(keypoints, pixels=pixels[rows], is_subpixel=is_subpixel))
+        return tracks, replace(state, num_frames=num_frames, num_started=num_started)
 
-        rgb: [H, W, 3]; mask: [H, W] bool, True = dynamic: nothing is followed to there; T_cw: [4,
-        4] expected pose.
-        """
-        if self._start is None:
-            return None
-        self._followed += 1
-        before = self._start
-        if len(before.ids) >= _MANY:
-            before = before.take(np.flatnonzero(before.ids % _TURNS == self._followed % _TURNS))
-        self._set_out = len(before.ids)
-        guess = (self._seen_from(T_cw, before.ids) + before.off).astype(np.float32)
-        starts, flags = before.keypoints.pixels.astype(np.float32), cv2.OPTFLOW_USE_INITIAL_FLOW
-        found, status, _ = cv2.calcOpticalFlowPyrLK(
-            before.gray, gray_of(rgb), starts, guess, None, None, _WINDOW, _LEVELS, _STOP, flags
-        )
-        pixels = np.asarray(found, dtype=np.float64)
-        rows = np.flatnonzero((status[:, 0] > 0) & _inside(pixels, self.map.camera))
-        rows = rows[before.masked[rows] | ~_covered(pixels[rows], mask)]
-        known = before.ids[rows]
-        ids, first = np.unique(self.map.current(known), return_index=True)
-        rows, same = rows[first], ids == known[first]
-        keypoints = before.keypoints.take(rows)
-        return Followed(
-            ids, replace(keypoints, pixels=pixels[rows], is_subpixel=keypoints.is_subpixel & same)
-        )
-
-    def locate(self, followed: Followed, features: Features, expected: Prediction) -> Fit | None:
-        """The pose on which enough of the points agree. features: of the followed corners."""
-        assert self._start is not None
-        least = max(_LEAST, _SHARE * self._set_out)
-        if len(features) < least:
-            return None
-        matches = Matches(followed.ids, np.arange(len(features)))
+    def estimate_pose(
+        self,
+        tracks: FlowTracks,
+        frame_features: FrameFeatures,
+        state: FlowState,
+        prediction: Prediction,
+    ) -> tuple[PoseEstimate | None, FlowState]:
+        """Return the pose on which enough tracked points agree. frame_features: of the tracks."""
+        features = frame_features.features
+        needed = max(self._config.min_inliers, self._config.min_inlier_ratio * state.num_started)
+        if len(features) < needed:
+            return None, state
+        matches = Matches(tracks.point_ids, np.arange(len(features)))
         points, seen = self.map.measured(matches, features)
-        prior = expected.given(len(features))
-        T_cw, inlier = optimize_pose(
-            expected.prior.T_cw, points, seen, self._reprojection, prior=prior
-        )
-        self._agree = int(inlier.sum())
-        if self._agree < least:
-            return None
+        prior = prediction.prior_for(len(features))
+        start = prediction.prior.T_cw
+        T_cw, inlier = optimize_pose(start, points, seen, self._reprojection, prior=prior)
+        num_inliers = int(inlier.sum())
+        state = replace(state, num_agreeing=num_inliers)
+        if num_inliers < needed:
+            return None, state
         information = pose_information(T_cw, points[inlier], seen.take(inlier), self._reprojection)
-        return Fit(T_cw, matches.take(inlier), self._start.reference, prior, information)
+        estimate = PoseEstimate(
+            T_cw,
+            matches.take(inlier),
+            frame_features,
+            num_inliers=num_inliers,
+            reference=state.reference,
+            prior=prior,
+            information=information,
+            source="flow",
+            allows_keyframe=False,
+        )
+        return estimate, state
 
-    @property
-    def left(self) -> float:
-        """Share of the points that set out on which the latest answer stands: a view that changes
-        loses them.
+    def needs_match(self, state: FlowState, in_hurry: bool, mapper_is_busy: bool) -> bool:
+        """Decide whether the frame that flow tracked is matched with the map as well.
+
+        in_hurry: there is no time for it; mapper_is_busy: the frame would not become a keyframe, so
+        that matching may wait unless much has changed.
         """
-        return self._agree / self._set_out
+        config = self._config
+        if in_hurry:
+            return state.num_frames > config.max_frames_between_matches
+        limit = (
+            config.max_frames_between_matches if mapper_is_busy else config.frames_between_matches
+        )
+        return state.num_frames > limit or state.tracked_ratio < config.rematch_below_ratio
 
-    def over(self, hurry: bool, busy: bool = False) -> bool:
-        """Whether the frame that was followed to is to be matched, and be begun from.
+    def _flow(
+        self, start: FlowState, gray: NDArray[np.uint8], T_cw: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Return where Lucas-Kanade finds the points, [m, 2] px, and [m] bool whether it does."""
+        if len(start.point_ids) == 0:
+            return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
+        config = self._config
+        count_and_epsilon = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+        guess = self._project(T_cw, start.point_ids) + start.offsets
+        found, status, _ = cv2.calcOpticalFlowPyrLK(
+            start.gray,
+            gray,
+            start.keypoints.pixels.astype(np.float32),
+            guess.astype(np.float32),
+            None,
+            None,
+            (config.window_px, config.window_px),
+            config.pyramid_levels,
+            (count_and_epsilon, config.max_iterations, config.epsilon_px),
+            cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        return np.asarray(found, dtype=np.float64), np.asarray(status[:, 0] > 0)
 
-        hurry: it may wait; busy: it would not become a keyframe, so that it may wait unless much
-        has changed.
-        """
-        if hurry:
-            return self._followed > _AT_MOST
-        return self._followed > (_AT_MOST if busy else _BETWEEN) or self.left < _MUCH_HAS_CHANGED
-
-    def _seen_from(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
-        """[m, 2] px as the lens shows them, of points of the map."""
+    def _project(self, T_cw: Array, ids: NDArray[np.int64]) -> Array:
+        """Return the distorted projections [m, 2] px of map points."""
         local = to_local(T_cw, self.map.positions[ids])
-        local[:, 2] = np.maximum(local[:, 2], _NEAR)
+        local[:, 2] = np.maximum(local[:, 2], MIN_DEPTH_M)
         camera = self.map.camera
         return camera.distort(camera.project(local))
 
 
-def _inside(pixels: Array, camera: Camera) -> NDArray[np.bool_]:
-    """[m] bool, of pixels [m, 2]: in the image."""
+def _is_inside(pixels: Array, camera: Camera) -> NDArray[np.bool_]:
+    """Return [m] bool, whether pixels [m, 2] lie in the image."""
     x, y = np.rint(pixels).T
     return np.asarray((x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
 
 
-def _covered(pixels: Array, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """[m] bool, of pixels [m, 2] in the image: under the mask."""
+def _is_covered(pixels: Array, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return [m] bool, whether pixels [m, 2] in the image lie under the mask."""
     if mask is None:
         return np.zeros(len(pixels), dtype=np.bool_)
     x, y = np.rint(pixels).astype(np.int64).T

@@ -1,138 +1,181 @@
-"""How the camera moves: a Kalman filter of constant velocity. It says where the next frame should
-be, and how surely.
+"""Constant-velocity Kalman filter that predicts the next frame's pose and how certain it is.
 
-A hand speeds up by .2 to .6 m/s^2 and 2 to 6 rad/s^2 per axis (RMS at 30 frames/s of TUM's seven
-motion-captured sequences), so that what a frame sees decides where it is, but one that sees only a
-corner of the room cannot leap.
+What a frame measures decides its pose, but a frame that sees only a part of the room cannot jump.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cohdc_train.slam.config import ACCELERATION, FEW, LONGEST, SHORTEST
+from cohdc_train.slam.config import MotionModelConfig
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
 from cohdc_train.slam.optimization.reprojection import Prior
 
-_UNKNOWN = np.repeat([1.0, 2.0], 3)  # m/s and rad/s: of a velocity of which nothing is known
-_EXACT = np.full(6, 1e-4)  # m and rad: no pose is known better, however many points say so
-_PAUSE = 10.0  # s, after which nothing more is forgotten
-_LEARNT = 0.2  # share of the latest frame in how calmly the camera is held to move
-_NOTHING = np.zeros(6)
-_SURPRISE = 100.0  # squared standard deviations of a pose, from which on it is a leap
+_MAX_VELOCITY_SIGMAS = 3  # of the initial velocity, above which a jump says nothing about velocity
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where a frame should be. calm: of late the camera has moved as foreseen."""
+    """Predicted pose of a frame. is_consistent: the latest frames were where they were predicted.
+
+    prior_below_points: points of a frame, below which the prior counts.
+    """
 
     prior: Prior
-    calm: bool
+    is_consistent: bool
+    prior_below_points: int
 
-    def given(self, points: int) -> Prior | None:
-        """What counts beside so many points that a frame sees: nothing where they suffice, or the
-        camera is shaken.
+    def prior_for(self, num_points: int) -> Prior | None:
+        """Return the prior for a frame that sees so many points.
+
+        None where these suffice, or where the camera does not move as predicted.
         """
-        return self.prior if self.calm and points < FEW else None
+        return self.prior if self.is_consistent and num_points < self.prior_below_points else None
 
 
-class MotionModel:
-    """Pose and velocity of the latest frame with their joint covariance [12, 12], of (m, rad, m/s,
-    rad/s).
+@dataclass(frozen=True)
+class _State:
+    """Pose and velocity of the latest frame.
+
+    timestamp: s; T_cw: [4, 4] m; velocity: [6] (m/s, rad/s); covariance: [12, 12] of both, (m, rad,
+    m/s, rad/s); interval_s: between the latest two frames, 0 while the velocity is unknown;
+    mean_nis: mean normalized innovation squared of the latest frames, per degree of freedom.
 
     Errors are those of a small motion in the camera's frame: T_true = exp(error) T.
     """
 
-    def __init__(self) -> None:
-        self._t: float | None = None
-        self._step = 0.0  # s between the latest two frames
-        self._T_cw = np.eye(4)
-        self._velocity = np.zeros(6)
-        self._covariance = np.zeros((12, 12))
-        self._unrest = 0.0  # squared surprise of late, as a share of the foreseen one
+    timestamp: float
+    T_cw: Array
+    velocity: Array
+    covariance: Array
+    interval_s: float
+    mean_nis: float
 
-    def forget(self) -> None:
-        """The place is lost: nothing is known."""
-        self._t = None
 
-    def carry(self, motion: Array) -> None:
-        """The map has moved, and the latest pose with it: T_cw becomes T_cw @ motion."""
-        self._T_cw = self._T_cw @ motion
+class MotionModel:
+    """Constant-velocity motion of the camera."""
+
+    def __init__(self, config: MotionModelConfig = MotionModelConfig()) -> None:
+        self._config = config
+        self._acceleration = np.repeat(config.acceleration_sigma, 3)
+        self._unknown_velocity = np.repeat(config.initial_velocity_sigma, 3)
+        self._state: _State | None = None
+
+    def reset(self) -> None:
+        """Forget the motion: the track is lost."""
+        self._state = None
+
+    def correct(self, motion: Array) -> None:
+        """Move the latest pose with the map: T_cw becomes T_cw @ motion, [4, 4]."""
+        if self._state is not None:
+            self._state = replace(self._state, T_cw=self._state.T_cw @ motion)
 
     @property
     def twist(self) -> Array | None:
-        """[6] velocity, (m/s, rad/s): T_cw(t + dt) = exp(twist dt) T_cw(t). None while it is not
-        known.
+        """Velocity [6], (m/s, rad/s), or None while unknown: T_cw(t + dt) = exp(twist dt) T_cw(t)."""
+        state = self._state
+        if state is None or not 0 < state.interval_s <= self._config.max_gap_s:
+            return None
+        return state.velocity
+
+    def predict(self, timestamp: float) -> Prediction | None:
+        """Predict the pose at a timestamp, s; None before the first frame and after a reset.
+
+        After a pause the camera is assumed to have moved on for max_gap_s only.
         """
-        return self._velocity if self._t is not None and 0 < self._step <= LONGEST else None
+        state = self._state
+        if state is None:
+            return None
+        prior = self._prior(state, timestamp, self._predict_covariance(state, timestamp))
+        return Prediction(prior, state.mean_nis < 1, self._config.prior_below_points)
 
-    def expected(self, t: float) -> Prediction:
-        """Where the camera is at t, s, later than the latest frame.
+    def update(
+        self,
+        timestamp: float,
+        T_cw: Array,
+        information: Array,
+        prior_gradient: Array | None = None,
+    ) -> None:
+        """Update the motion with the pose of a frame.
 
-        After a pause it is held to have gone on for as long as its velocity is known to say
-        something.
+        T_cw: [4, 4] m; information: [6, 6] of the frame's measurements; prior_gradient: [6]
+        `Prior.gradient` of the prediction where the pose is a compromise with it.
         """
-        return Prediction(self._prior(t, self._predicted(t)), self._unrest < 1)
-
-    def found(self, t: float, T_cw: Array, information: Array, pull: Array = _NOTHING) -> None:
-        """The frame at t is at T_cw. information: [6, 6] of what it saw; pull: [6] `Prior.pull` of
-        what was expected, where T_cw is a compromise with that."""
-        seen = np.asarray(
-            np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(_EXACT**2), dtype=np.float64
+        floor = np.full(6, self._config.pose_noise_floor)
+        covariance = np.asarray(
+            np.linalg.inv(information + 1e-6 * np.eye(6)) + np.diag(floor**2), dtype=np.float64
         )
-        if self._t is None:
-            self._begin(T_cw, seen)
-            self._unrest = 0.0
+        gradient = np.zeros(6) if prior_gradient is None else prior_gradient
+        if self._state is None:
+            start = np.zeros(6)
+            self._state = self._restarted(timestamp, T_cw, covariance, start, 0.0, 0.0)
         else:
-            self._update(t, T_cw, seen, pull)
-        self._t = t
+            self._state = self._updated(self._state, timestamp, T_cw, covariance, gradient)
 
-    def _begin(self, T_cw: Array, seen: Array, velocity: Array | None = None) -> None:
-        """At a pose, known by the covariance [6, 6] of what was seen, with a velocity of which
-        little is known.
+    def _restarted(
+        self,
+        timestamp: float,
+        T_cw: Array,
+        measured: Array,
+        velocity: Array,
+        interval_s: float,
+        mean_nis: float,
+    ) -> _State:
+        """Return the state at a pose of covariance [6, 6] `measured`, with a nearly unknown velocity."""
+        covariance = np.diag(np.concatenate([np.zeros(6), self._unknown_velocity**2]))
+        covariance[:6, :6] = measured
+        return _State(timestamp, T_cw, velocity, covariance, interval_s, mean_nis)
+
+    def _updated(
+        self, state: _State, timestamp: float, T_cw: Array, measured: Array, gradient: Array
+    ) -> _State:
+        """Return the state after a measured pose: the step of the Kalman filter.
+
+        measured: [6, 6] covariance of the pose.
         """
-        self._T_cw = T_cw
-        if velocity is None:
-            self._step = 0.0
-        self._velocity = np.zeros(6) if velocity is None else velocity
-        self._covariance = np.diag(np.concatenate([np.zeros(6), _UNKNOWN**2]))
-        self._covariance[:6, :6] = seen
+        config = self._config
+        covariance = self._predict_covariance(state, timestamp)
+        prior = self._prior(state, timestamp, covariance)
+        interval_s = timestamp - state.timestamp
 
-    def _update(self, t: float, T_cw: Array, seen: Array, pull: Array) -> None:
-        assert self._t is not None
-        covariance = self._predicted(t)
-        expected = self._prior(t, covariance)
-        self._step = t - self._t
-        off = log_se3(T_cw @ inverse(expected.T_cw))
-        spread = covariance[:6, :6] + seen
-        off = off + seen @ pull  # by how much it was before the compromise
-        inverted = np.linalg.inv(spread)
-        surprise = float(off @ inverted @ off)
-        self._unrest += _LEARNT * (min(surprise, _SURPRISE) / 6 - self._unrest)
-        if surprise > _SURPRISE:
-            velocity = log_se3(T_cw @ inverse(self._T_cw)) / max(self._step, SHORTEST)
-            self._begin(T_cw, seen, velocity if np.all(np.abs(velocity) < 3 * _UNKNOWN) else None)
-            return
+        # The innovation, by how much it was before the compromise with the prior.
+        innovation = log_se3(T_cw @ inverse(prior.T_cw)) + measured @ gradient
+        innovation_covariance = covariance[:6, :6] + measured
+        inverted = np.linalg.inv(innovation_covariance)
+        nis = float(innovation @ inverted @ innovation)
+        change = min(nis, config.max_nis) / 6 - state.mean_nis
+        mean_nis = state.mean_nis + config.nis_smoothing * change
+
+        if nis > config.max_nis:  # a jump: the pose is believed, the motion starts again
+            velocity = log_se3(T_cw @ inverse(state.T_cw)) / max(interval_s, config.min_gap_s)
+            limit = _MAX_VELOCITY_SIGMAS * self._unknown_velocity
+            if not np.all(np.abs(velocity) < limit):
+                velocity, interval_s = np.zeros(6), 0.0
+            return self._restarted(timestamp, T_cw, measured, velocity, interval_s, mean_nis)
+
         gain = covariance[:, :6] @ inverted
-        correction = gain @ off
-        self._T_cw = exp_se3(correction[:6]) @ expected.T_cw
-        self._velocity = self._velocity + correction[6:]
-        self._covariance = covariance - gain @ spread @ gain.T
+        correction = gain @ innovation
+        return _State(
+            timestamp,
+            exp_se3(correction[:6]) @ prior.T_cw,
+            state.velocity + correction[6:],
+            covariance - gain @ innovation_covariance @ gain.T,
+            interval_s,
+            mean_nis,
+        )
 
-    def _prior(self, t: float, predicted: Array) -> Prior:
-        """The pose at t and how surely, of the covariance [12, 12] predicted for then."""
-        information = np.asarray(np.linalg.inv(predicted[:6, :6]), dtype=np.float64)
-        return Prior(exp_se3(self._ahead(t) * self._velocity) @ self._T_cw, information)
+    def _prior(self, state: _State, timestamp: float, covariance: Array) -> Prior:
+        """Return the pose predicted for a timestamp, and its information by covariance [12, 12]."""
+        information = np.asarray(np.linalg.inv(covariance[:6, :6]), dtype=np.float64)
+        longest = max(state.interval_s, self._config.max_gap_s)
+        ahead_s = min(max(timestamp - state.timestamp, 0.0), longest)
+        return Prior(exp_se3(ahead_s * state.velocity) @ state.T_cw, information)
 
-    def _ahead(self, t: float) -> float:
-        """s for which the velocity is held."""
-        assert self._t is not None
-        return min(max(t - self._t, 0.0), max(self._step, LONGEST))
-
-    def _predicted(self, t: float) -> Array:
-        """[12, 12] covariance at t, before anything is seen."""
-        assert self._t is not None
-        dt, identity = min(max(t - self._t, 0.0), _PAUSE), np.eye(6)
+    def _predict_covariance(self, state: _State, timestamp: float) -> Array:
+        """Return the covariance [12, 12] at a timestamp, before anything is measured."""
+        dt = min(max(timestamp - state.timestamp, 0.0), self._config.max_prediction_s)
+        identity = np.eye(6)
         step = np.block([[identity, dt * identity], [np.zeros((6, 6)), identity]])
-        noise = np.concatenate([dt * dt / 2 * np.diag(ACCELERATION), dt * np.diag(ACCELERATION)])
-        return np.asarray(step @ self._covariance @ step.T + noise @ noise.T)
+        acceleration = np.diag(self._acceleration)
+        noise = np.concatenate([dt * dt / 2 * acceleration, dt * acceleration])
+        return np.asarray(step @ state.covariance @ step.T + noise @ noise.T)

@@ -2,30 +2,59 @@
 
 import time
 
-from cohdc_train.slam.frame import Pose, PoseCallback
+import numpy as np
+from numpy.typing import NDArray
+
+from cohdc_train.slam.frame import FrameResult, FrameTiming, PoseCallback, RGBDFrame, Status
 from cohdc_train.slam.geometry.se3 import inverse
-from cohdc_train.slam.tracking.localizer import Fit
+from cohdc_train.slam.tracking.pose_estimate import FrameFeatures, PoseEstimate
 
 
 class PoseReporter:
-    """A frame's pose from when it is known, and the time that took from the answer's making on."""
+    """Results of one frame, and the time until its pose was known."""
 
-    def __init__(self, t: float, on_pose: PoseCallback | None) -> None:
-        self._t, self._on_pose = t, on_pose
-        self._start = time.perf_counter()
-        self._known: float | None = None
+    def __init__(
+        self,
+        frame: RGBDFrame,
+        mask: NDArray[np.bool_] | None,
+        is_initialized: bool,
+        on_pose: PoseCallback | None,
+    ) -> None:
+        """Start the clock. is_initialized: there is a map; on_pose: called with the first pose."""
+        self._start_s = time.perf_counter()
+        self._frame = frame
+        self._mask = mask
+        self._status_without_pose: Status = "lost" if is_initialized else "initializing"
+        self._on_pose = on_pose
+        self._known_s: float | None = None
 
-    def give(self, fit: Fit | None) -> None:
-        """The first one counts, and is told."""
-        if self._known is not None:
+    def publish(self, result: PoseEstimate | FrameFeatures) -> None:
+        """Publish the frame's pose, or that it has none; only the first call counts."""
+        if self._known_s is not None:
             return
-        self._known = time.perf_counter()
+        self._known_s = time.perf_counter()
         if self._on_pose is not None:
-            self._on_pose(self.pose(fit, keyframe=False))
+            self._on_pose(self.result(result))
 
-    def pose(self, fit: Fit | None, keyframe: bool) -> Pose:
-        """What became of the frame so far. fit: None when the place is lost."""
-        assert self._known is not None
-        T_wc, inliers = (None, 0) if fit is None else (inverse(fit.T_cw), len(fit.matches))
-        rest = time.perf_counter() - self._known
-        return Pose(self._t, T_wc, keyframe, inliers, 1e3 * (self._known - self._start), 1e3 * rest)
+    def result(
+        self, result: PoseEstimate | FrameFeatures, is_keyframe: bool = False
+    ) -> FrameResult:
+        """Return the result so far. result: keypoints alone where the frame has no pose."""
+        now = time.perf_counter()
+        known_s = now if self._known_s is None else self._known_s
+        tracking_ms, mapping_ms = 1e3 * (known_s - self._start_s), 1e3 * (now - known_s)
+        estimate = result if isinstance(result, PoseEstimate) else None
+        frame_features = result.frame_features if isinstance(result, PoseEstimate) else result
+        return FrameResult(
+            timestamp=self._frame.timestamp,
+            T_wc=None if estimate is None else inverse(estimate.T_cw),
+            status=self._status_without_pose if estimate is None else "tracking",
+            source="map" if estimate is None else estimate.source,
+            is_keyframe=is_keyframe,
+            num_matches=0 if estimate is None else len(estimate.matches),
+            num_inliers=0 if estimate is None else estimate.num_inliers,
+            features=frame_features.features,
+            dynamic_mask=frame_features.dynamic_mask,
+            given_mask=self._mask,
+            timing=FrameTiming(tracking_ms, mapping_ms, depth_ms=self._frame.depth_ms),
+        )

@@ -1,11 +1,10 @@
 """Keypoints and masks drawn over color images."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cohdc_train.drawing import draw_outline
 from cohdc_train.slam.features.keypoints import Features
 
 _GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
@@ -14,33 +13,29 @@ _GREEN, _RED, _YELLOW = (60, 220, 60), (230, 40, 40), (255, 220, 0)  # RGB
 def draw_before(
     rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_] | None
 ) -> NDArray[np.uint8]:
-    """All corners an unmasked search finds: red on the mask, green elsewhere. Returns [H, W, 3]
-    RGB.
+    """Draw the keypoints of a search without a mask: red on the mask, green elsewhere.
+
+    Args:
+        rgb: [H, W, 3].
+        features: keypoints of the whole image.
+        mask: [H, W] bool, True = dynamic.
+
+    Returns:
+        [H, W, 3] RGB.
     """
-    rows, columns = (
-        np.rint(features.pixels[:, 1]).astype(int),
-        np.rint(features.pixels[:, 0]).astype(int),
-    )
+    rows = np.rint(features.pixels[:, 1]).astype(int)
+    columns = np.rint(features.pixels[:, 0]).astype(int)
     on_mask = np.zeros(len(features), dtype=np.bool_) if mask is None else mask[rows, columns]
     image = rgb.copy()
-    for x, y, red in zip(columns.tolist(), rows.tolist(), on_mask.tolist(), strict=True):
-        cv2.circle(image, (x, y), 2, _RED if red else _GREEN, 1, cv2.LINE_AA)
+    for x, y, is_masked in zip(columns.tolist(), rows.tolist(), on_mask.tolist(), strict=True):
+        cv2.circle(image, (x, y), 2, _RED if is_masked else _GREEN, 1, cv2.LINE_AA)
     return image
 
 
 def draw_after(
     rgb: NDArray[np.uint8], features: Features, mask: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """The corners that were kept, and the outline of the mask. Returns [H, W, 3] RGB."""
+    """Draw the keypoints that were kept, and the outline of the mask. Returns [H, W, 3] RGB."""
     image = draw_before(rgb, features, None)
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image, contours, -1, _YELLOW, 2)
+    draw_outline(image, mask, _YELLOW, thickness=2)
     return image
-
-
-def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Write [H, W, 3] RGB as JPEG."""
-    _, data = cv2.imencode(
-        ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90]
-    )
-    path.write_bytes(data.tobytes())

@@ -1,4 +1,4 @@
-"""tools/experiments/carried_masks.py: how well masks are carried on, measured."""
+"""tools/experiments/carried_masks.py measures how well masks are propagated."""
 
 import json
 import sys
@@ -25,28 +25,28 @@ def run(
     tool.main()
 
 
-def test_it_says_how_much_of_the_people_and_of_the_rest_is_covered(
+def test_table_holds_covered_share_of_people_and_of_the_rest(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(tool, monkeypatch, tmp_path, 24, "1", "10")
     one, ten = json.loads((tmp_path / "out" / "carried_masks.json").read_text())
     assert (one["frames"], ten["frames"]) == (1, 10)
     for row in (one, ten):
-        assert row["covered"] > 0.97, "left where it was, it would cover .85"
+        assert row["covered"] > 0.97, "without propagation it would cover .85"
         assert 0 <= row["others"] < 0.01
     assert (
         f"| plane | 10 | {ten['iou']:.3f} |" in (tmp_path / "out" / "carried_masks.md").read_text()
     )
 
 
-def test_likeness_counts_pixels(tool: ModuleType) -> None:
+def test_overlap_counts_pixels(tool: ModuleType) -> None:
     truth, mask = np.zeros((2, 10, 10), dtype=np.bool_)
     truth[:4, :5] = True
     mask[2:6, :5] = True
-    assert tool.likeness(mask, truth) == (10 / 30, 10 / 20, 10 / 80)
+    assert tool.overlap(mask, truth) == (10 / 30, 10 / 20, 10 / 80)
 
 
-def test_a_sequence_too_short_for_the_steps_is_named(
+def test_sequence_shorter_than_the_steps_is_an_error(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(
@@ -55,7 +55,7 @@ def test_a_sequence_too_short_for_the_steps_is_named(
         run(tool, monkeypatch, tmp_path, 4, "1", "4")
 
 
-def test_steps_begin_at_one(
+def test_steps_below_one_are_an_error(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(SystemExit, match="1 or more, not 0"):

@@ -11,7 +11,7 @@ from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.rolling_shutter import undo_rolling_shutter
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, to_local
 
-ROLLING = replace(CAMERA, readout=0.02)
+ROLLING = replace(CAMERA, readout_s=0.02)
 speeds = st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6)
 
 
@@ -26,7 +26,7 @@ def seen(points: Array, twist: Array) -> Features:
             ]
         )
         pixels = CAMERA.project(local)
-        late = ROLLING.readout * (pixels[:, 1] / CAMERA.height - 0.5)
+        late = ROLLING.readout_s * (pixels[:, 1] / CAMERA.height - 0.5)
     return features_at(pixels, local[:, 2])
 
 
@@ -36,10 +36,10 @@ def test_corners_are_where_the_middle_row_s_moment_has_them(speed: list[float]) 
     twist = np.array(speed)
     measured = seen(points, twist)
     result = undo_rolling_shutter(measured, ROLLING, twist)
-    np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.03)
+    np.testing.assert_allclose(result.undistorted, CAMERA.project(points), atol=0.03)
     np.testing.assert_allclose(result.depths, points[:, 2], atol=3e-4)
     np.testing.assert_array_equal(
-        undo_rolling_shutter(measured, CAMERA, twist).points, measured.points
+        undo_rolling_shutter(measured, CAMERA, twist).undistorted, measured.undistorted
     )
 
 
@@ -50,8 +50,8 @@ def test_a_corner_without_depth_moves_like_the_others() -> None:
     blind = replace(measured, depths=np.where(np.arange(30) % 3 == 0, np.nan, measured.depths))
     result = undo_rolling_shutter(blind, ROLLING, twist)
     assert np.isnan(result.depths).sum() == 10
-    np.testing.assert_allclose(result.points, CAMERA.project(points), atol=0.1)
+    np.testing.assert_allclose(result.undistorted, CAMERA.project(points), atol=0.1)
     nothing = replace(measured, depths=np.full(30, np.nan))
     np.testing.assert_array_equal(
-        undo_rolling_shutter(nothing, ROLLING, twist).points, measured.points
+        undo_rolling_shutter(nothing, ROLLING, twist).undistorted, measured.undistorted
     )

@@ -1,4 +1,4 @@
-"""ROS 2 without ROS: messages in and out, and the node among stand-ins for rclpy."""
+"""Conversion of ROS 2 messages, and the node with stand-ins for rclpy."""
 
 import os
 import signal
@@ -19,8 +19,15 @@ from tool_loader import load_tool
 
 from cohdc_train.errors import DataError
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.ros import camera_of, depth_of, fill_mask, fill_pose, rgb_of, seconds
-from cohdc_train.trajectory.trajectory import read_tum
+from cohdc_train.slam.io.ros import (
+    camera_from_message,
+    depth_from_message,
+    fill_mask,
+    fill_pose,
+    rgb_from_message,
+    to_seconds,
+)
+from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 8
 
@@ -28,7 +35,7 @@ FRAMES = 8
 def image(
     encoding: str, pixels: NDArray[Any], padding: int = 0, big: bool = False
 ) -> SimpleNamespace:
-    """A sensor_msgs/Image as a driver fills it: data is an array of bytes, rows may be padded."""
+    """Return a sensor_msgs/Image as a driver fills it; padding: bytes at the end of a row."""
     height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))).view(
         np.uint8
@@ -47,7 +54,7 @@ def rgb() -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("padding", [0, 5])
-def test_colour_encodings(rgb: NDArray[np.uint8], padding: int) -> None:
+def test_color_encodings(rgb: NDArray[np.uint8], padding: int) -> None:
     alpha = np.full((6, 9, 1), 7, np.uint8)
     messages = {
         "rgb8": rgb,
@@ -57,32 +64,32 @@ def test_colour_encodings(rgb: NDArray[np.uint8], padding: int) -> None:
     }
     for encoding, pixels in messages.items():
         np.testing.assert_array_equal(
-            rgb_of(image(encoding, pixels, padding)), rgb, err_msg=encoding
+            rgb_from_message(image(encoding, pixels, padding)), rgb, err_msg=encoding
         )
-    gray = rgb_of(image("mono8", rgb[..., 0], padding))
+    gray = rgb_from_message(image("mono8", rgb[..., 0], padding))
     np.testing.assert_array_equal(gray, np.repeat(rgb[..., :1], 3, axis=2))
 
 
 @pytest.mark.parametrize("big", [False, True])
 def test_depth_encodings(big: bool) -> None:
     meters = np.array([[0.0, 1.234, 2.5], [np.nan, np.inf, 4.0]], np.float32)
-    millimetres = np.array([[0, 1234, 2500], [0, 0, 4000]], np.uint16)
+    millimeters = np.array([[0, 1234, 2500], [0, 0, 4000]], np.uint16)
     expected = np.array([[0, 1.234, 2.5], [0, 0, 4]], np.float32)
-    for message in (image("32FC1", meters, 8, big), image("16UC1", millimetres, 2, big)):
-        depth = depth_of(message)
+    for message in (image("32FC1", meters, 8, big), image("16UC1", millimeters, 2, big)):
+        depth = depth_from_message(message)
         assert depth.dtype == np.float32
         np.testing.assert_allclose(depth, expected, rtol=1e-6)
 
 
-def test_messages_that_cannot_be_used_are_named(rgb: NDArray[np.uint8]) -> None:
+def test_unusable_messages_are_named(rgb: NDArray[np.uint8]) -> None:
     with pytest.raises(DataError, match="encoding 'yuv422' is not one of rgb8 bgr8"):
-        rgb_of(image("yuv422", rgb))
+        rgb_from_message(image("yuv422", rgb))
     with pytest.raises(DataError, match="encoding 'rgb8' is not one of 16UC1"):
-        depth_of(image("rgb8", rgb))
+        depth_from_message(image("rgb8", rgb))
     short = image("rgb8", rgb)
     short.data = short.data[:-1]
     with pytest.raises(DataError, match="161 bytes are too few for 9x6 rgb8 of step 27"):
-        rgb_of(short)
+        rgb_from_message(short)
 
 
 def info(**changes: Any) -> SimpleNamespace:
@@ -98,30 +105,30 @@ def info(**changes: Any) -> SimpleNamespace:
 
 
 def test_camera_info() -> None:
-    plain = camera_of(info())
+    plain = camera_from_message(info())
     assert plain == Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1000.0)
-    bent = camera_of(info(d=[0.1, -0.2, 0.001, 0.002, 0.3]))
+    bent = camera_from_message(info(d=[0.1, -0.2, 0.001, 0.002, 0.3]))
     assert (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3) == (0.1, -0.2, 0.001, 0.002, 0.3)
     assert (
-        camera_of(info(d=[0.1, 0, 0, 0, 0, 0, 0, 0], distortion_model="rational_polynomial")).k1
+        camera_from_message(
+            info(d=[0.1, 0, 0, 0, 0, 0, 0, 0], distortion_model="rational_polynomial")
+        ).k1
         == 0.1
     )
-    with pytest.raises(DataError, match="'equidistant' of 4 coefficients"):
-        camera_of(info(d=[0.1] * 4, distortion_model="equidistant"))
-    with pytest.raises(DataError, match="of 8 coefficients"):
-        camera_of(info(d=[0.1] * 8, distortion_model="rational_polynomial"))
+    with pytest.raises(DataError, match="'equidistant' with 4 coefficients"):
+        camera_from_message(info(d=[0.1] * 4, distortion_model="equidistant"))
+    with pytest.raises(DataError, match="with 8 coefficients"):
+        camera_from_message(info(d=[0.1] * 8, distortion_model="rational_polynomial"))
     with pytest.raises(DataError, match="not calibrated, fx is 0"):
-        camera_of(info(k=[0] * 9))
+        camera_from_message(info(k=[0] * 9))
 
 
 def pose_message() -> SimpleNamespace:
     return SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())
 
 
-def test_poses_go_out_in_the_axes_of_ros() -> None:
-    """The first camera looks along x with its upper edge along z; what lies 2 m ahead of it lies at
-    x = 2 m.
-    """
+def test_poses_are_published_in_the_axes_of_ros() -> None:
+    """The first camera looks along x, with its upper edge along z."""
     T_wc = np.eye(4)
     T_wc[:3, 3] = (0.5, 0.25, 3.0)  # right, down, forward
     message = pose_message()
@@ -133,23 +140,23 @@ def test_poses_go_out_in_the_axes_of_ros() -> None:
     np.testing.assert_allclose(R @ [0, -1, 0], [0, 0, 1], atol=1e-12)
 
 
-def test_a_mask_goes_out_and_comes_back() -> None:
+def test_mask_survives_a_round_trip() -> None:
     mask = np.random.default_rng(1).random((5, 7)) < 0.5
     message = SimpleNamespace()
     fill_mask(message, mask)
-    np.testing.assert_array_equal(rgb_of(message)[..., 0] > 0, mask)
+    np.testing.assert_array_equal(rgb_from_message(message)[..., 0] > 0, mask)
     assert set(message.data) == {0, 255}
 
 
-def test_seconds() -> None:
-    assert seconds(SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000)) == 1_700_000_000.25
+def test_stamp_is_converted_to_seconds() -> None:
+    assert to_seconds(SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000)) == 1_700_000_000.25
 
 
 # ---- the node
 
 
 class Message:
-    """Any message: fields appear when they are asked for."""
+    """Message of any type, with fields that are made on access."""
 
     def __getattr__(self, name: str) -> "Message":
         if name.startswith("__"):
@@ -159,13 +166,15 @@ class Message:
 
 
 class Publisher:
+    """Stand-in for a publisher, which collects the messages."""
+
     def __init__(self) -> None:
         self.sent: list[Any] = []
         self.publish = self.sent.append
 
 
 class Node:
-    """What the node uses of rclpy.node.Node."""
+    """Stand-in for rclpy.node.Node."""
 
     parameters: ClassVar[dict[str, Any]] = {}
 
@@ -188,6 +197,8 @@ class Node:
 
 
 class Synchronizer:
+    """Stand-in for message_filters' synchronizer."""
+
     def __init__(self, inputs: list[Any], size: int, slop: float) -> None: ...
 
     def registerCallback(self, callback: Callable[[Any, Any], None]) -> None:  # noqa: N802 - ROS's name
@@ -195,7 +206,7 @@ class Synchronizer:
 
 
 def drive(node: Any) -> None:
-    """In the place of rclpy.spin: a camera that waits for each pose, then Ctrl-C."""
+    """Send frames, each after the pose of the one before, then Ctrl-C; replaces rclpy.spin."""
     node.callbacks["color/camera_info"](info())
     answered = threading.Event()
     node.publishers["pose"].publish = lambda m: (
@@ -216,7 +227,7 @@ def drive(node: Any) -> None:
 
 @pytest.fixture
 def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """tools/ros2/cohdc_slam_node.py among stand-ins for the modules of ROS 2 that it imports."""
+    """Load tools/ros2/cohdc_slam_node.py with stand-ins for the modules of ROS 2."""
     contents: dict[str, dict[str, Any]] = {
         "rclpy": {"init": lambda **_: None, "spin": drive, "try_shutdown": lambda: None},
         "rclpy.node": {"Node": Node},
@@ -241,18 +252,21 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return load_tool("ros2/cohdc_slam_node.py")
 
 
-def test_the_node_publishes_and_writes(
+def test_node_publishes_poses_and_writes_results(
     ros: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes = []
 
-    class Noted(ros.SlamNode):  # type: ignore[misc, name-defined]
+    class RecordedNode(ros.SlamNode):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
             nodes.append(self)
 
-    monkeypatch.setattr(ros, "SlamNode", Noted)
-    monkeypatch.setattr(Node, "parameters", {"out": str(tmp_path / "run"), "features": 400})
+    monkeypatch.setattr(ros, "SlamNode", RecordedNode)
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("features:\n  max_keypoints: 400\n")
+    parameters = {"out": str(tmp_path / "run"), "settings": str(settings)}
+    monkeypatch.setattr(Node, "parameters", parameters)
     ros.main()
     sent = {topic: publisher.sent for topic, publisher in nodes[0].publishers.items()}
     assert len(sent["pose"]) == FRAMES
@@ -263,20 +277,20 @@ def test_the_node_publishes_and_writes(
     truth = camera_path(FRAMES)[-1]
     last = sent["pose"][-1].pose.position
     np.testing.assert_allclose([-last.y, -last.z, last.x], truth[:3, 3], atol=0.01)
-    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
+    assert len(Trajectory.load_tum(tmp_path / "run" / "trajectory.txt")) == FRAMES
 
 
-def test_the_newest_frame_replaces_the_one_that_waits(
+def test_newest_frame_replaces_the_waiting_one(
     ros: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ros, "WAIT", 0.01)
+    monkeypatch.setattr(ros, "POLL_S", 0.01)
     node = ros.SlamNode()
     for second in (1, 2, 3):
         color = image("rgb8", np.full((2, 2, 3), second, np.uint8))
         color.header = SimpleNamespace(stamp=SimpleNamespace(sec=second, nanosec=0))
-        node._take(color, image("32FC1", np.ones((2, 2), np.float32)))
+        node._put(color, image("32FC1", np.ones((2, 2), np.float32)))
     frames = node.frames()
     first = next(frames)
     assert first is not None
     assert first[2] == 3.0
-    assert next(frames) is None, "and then there is none"
+    assert next(frames) is None, "no second frame waits"

@@ -1,6 +1,4 @@
-"""A rectified stereo pair: Q against OpenCV's, depth against the truth, a sequence through the
-command.
-"""
+"""Depth of a rectified stereo pair, against OpenCV and the truth."""
 
 import json
 from pathlib import Path
@@ -15,10 +13,11 @@ from plane_world import CAMERA, CAMERA_YAML, camera_path, passer_by, render, roo
 
 from cohdc_train.cli import main
 from cohdc_train.errors import DataError
+from cohdc_train.slam.config import DepthConfig, StereoConfig
 from cohdc_train.slam.geometry.calibration import load_camera
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.sources import Recorded
-from cohdc_train.slam.io.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_layout
+from cohdc_train.slam.io.sources import RecordedSequence
+from cohdc_train.slam.io.stereo import StereoMatcher, reproject, reprojection_matrix, stereo_format
 
 BASELINE = 0.12
 PAIR = Camera(260.0, 260.0, 159.5, 119.5, 320, 240, 1.0, baseline=BASELINE)
@@ -26,16 +25,14 @@ STEREO_YAML = CAMERA_YAML.replace("depth_scale: 5000", f"baseline: {BASELINE}")
 
 
 def right_of(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the right camera stands."""
+    """Return the pose of the right camera [4, 4]."""
     offset = np.eye(4)
     offset[0, 3] = BASELINE
     return T_wc @ offset
 
 
 def write_stereo(folder: Path, frames: int, with_passer_by: bool = False) -> Path:
-    """plane_world's folder with left/ and right/ in the place of rgb/ and depth/; right stamps are
-    1 ms late.
-    """
+    """Write a stereo sequence; the right images are 1 ms later than the left ones."""
     write_sequence(folder, frames, with_passer_by)
     (folder / "right").mkdir()
     lines = []
@@ -61,7 +58,7 @@ def write_stereo(folder: Path, frames: int, with_passer_by: bool = False) -> Pat
     st.floats(0.02, 1.0),
     st.integers(0, 999),
 )
-def test_reprojection_is_opencvs(
+def test_reprojection_equals_that_of_opencv(
     f: float, cx: float, cy: float, baseline: float, seed: int
 ) -> None:
     camera = Camera(f, f, cx, cy, 40, 30, 1.0, baseline=baseline)
@@ -79,7 +76,7 @@ def test_reprojection_is_opencvs(
     np.testing.assert_allclose(camera.project(points[3, 7]), [7, 3], atol=1e-6)
 
 
-def test_depth_of_a_pair_is_the_true_depth() -> None:
+def test_depth_of_a_pair_agrees_with_the_truth() -> None:
     T_wc = camera_path(60)[17]
     left, depth, _ = render(room(), T_wc)
     right, _, _ = render(room(), right_of(T_wc))
@@ -88,7 +85,7 @@ def test_depth_of_a_pair_is_the_true_depth() -> None:
     assert found.shape == depth.shape
     assert found.dtype == np.float32
     assert matched[:, 64:].mean() > 0.8, (
-        "beyond the border where the right camera sees nothing, most is matched"
+        "most pixels are matched, except at the border that only the left camera sees"
     )
     disparity_error = PAIR.fx * BASELINE * np.abs(1 / found[matched] - 1 / depth[matched])
     assert np.median(disparity_error) < 0.2
@@ -96,18 +93,17 @@ def test_depth_of_a_pair_is_the_true_depth() -> None:
 
 
 @pytest.mark.slow
-def test_a_stereo_sequence_is_tracked(tmp_path: Path) -> None:
+def test_stereo_sequence_is_tracked(tmp_path: Path) -> None:
     sequence = write_stereo(tmp_path / "pair", 30, with_passer_by=True)
     words = [
         "slam",
-        "--sequence",
         str(sequence),
         "--masks",
         str(sequence / "masks"),
         "--out",
         str(tmp_path / "run"),
     ]
-    assert main([*words, "--features", "500", "--cloud"]) == 0
+    assert main([*words, "--settings.features.max_keypoints", "500", "--dense_cloud"]) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["frames"] == 30
     assert metrics["coverage"] == 1.0
@@ -116,11 +112,11 @@ def test_a_stereo_sequence_is_tracked(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "cloud.ply").stat().st_size > 50_000
 
 
-def test_a_camera_with_a_baseline_needs_no_depth_scale(tmp_path: Path) -> None:
+def test_camera_with_a_baseline_needs_no_depth_scale(tmp_path: Path) -> None:
     (tmp_path / "camera.yaml").write_text(STEREO_YAML)
     assert load_camera(tmp_path / "camera.yaml") == PAIR
-    assert CAMERA.far == 5.0
-    assert PAIR.far == pytest.approx(4.8)
+    assert DepthConfig().limit_m(CAMERA.baseline) == 5.0
+    assert DepthConfig().limit_m(PAIR.baseline) == pytest.approx(4.8)
 
 
 @pytest.mark.parametrize(
@@ -137,22 +133,29 @@ def test_a_camera_with_a_baseline_needs_no_depth_scale(tmp_path: Path) -> None:
     ],
     ids=["no baseline", "distortion", "two focal lengths", "negative", "neither"],
 )
-def test_a_camera_that_is_no_rectified_pair_is_refused(
+def test_camera_of_an_unrectified_pair_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], yaml: str, said: str
 ) -> None:
     sequence = write_stereo(tmp_path / "pair", 1)
     (sequence / "camera.yaml").write_text(yaml)
-    assert main(["slam", "--sequence", str(sequence), "--out", str(tmp_path / "out")]) == 1
+    assert main(["slam", str(sequence), "--out", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err
     assert said in error
     assert len(error.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["pair"]
 
 
-def test_pairs_that_are_not_simultaneous_are_none(tmp_path: Path) -> None:
+def test_images_too_far_apart_in_time_are_no_pair(tmp_path: Path) -> None:
     sequence = write_stereo(tmp_path / "pair", 2)
     (sequence / "right.txt").write_text("100.010 right/0000.png\n")
     with pytest.raises(
         DataError, match=r"pair: no image of left\.txt lies within 0\.005 s of one of right\.txt"
     ):
-        Recorded(sequence, PAIR, stereo_layout(PAIR))
+        RecordedSequence(sequence, PAIR, stereo_format(PAIR))
+
+
+def test_options_of_stereo_depth_reach_matcher_and_lists() -> None:
+    config = StereoConfig(max_time_difference_s=0.5, max_disparity_ratio=0.1, block_px=7)
+    matcher = StereoMatcher(PAIR, config)._matcher
+    assert (matcher.getNumDisparities(), matcher.getBlockSize()) == (32, 7)
+    assert stereo_format(PAIR, config).max_difference_s == 0.5

@@ -1,4 +1,4 @@
-"""A camera that walks round a hall and comes back, with loops and without."""
+"""Loop closing of a camera that walks around a hall and comes back."""
 
 import copy
 
@@ -7,197 +7,214 @@ import pytest
 from loop_world import View, poor_view, way_round
 from plane_world import CAMERA
 
-from cohdc_train.slam.config import Method
-from cohdc_train.slam.frame import Pose
+from cohdc_train.slam.config import BundleAdjustmentConfig, SlamConfig
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.geometry.depth_image import DepthImage, make_depth_image
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse
-from cohdc_train.slam.loop_closing.verification import Loop, LoopVerifier
+from cohdc_train.slam.loop_closing.verification import (
+    LoopConstraint,
+    LoopVerifier,
+    LoopVerifierConfig,
+)
 from cohdc_train.slam.mapping.global_bundle_adjustment import adjust_everything
 from cohdc_train.slam.mapping.keyframe import Keyframe, observations
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel, chi_square
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.system import Slam
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
 
 FRAMES = 180
 TRUTH = way_round(FRAMES)
-Run = tuple[Tracker, list[Pose]]
+REPROJECTION = ReprojectionModel(CAMERA)
+Run = tuple[Slam, list[FrameResult]]
 
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
+    """Render the hall with a poor sensor."""
     rng = np.random.default_rng(1)
     return [poor_view(pose, rng) for pose in TRUTH]
 
 
 def run(views: list[View], loops: bool) -> Run:
-    """With corners on whole pixels, or it would not drift; the motion always starts from the latest
-    frame's pose.
+    """Track without patch refinement, so that the pose drifts.
+
+    The predicted motion must always start from the pose of the latest frame, also after a loop.
     """
-    tracker, poses = Tracker(CAMERA, features=200, method=Method(loops=loops, refinement=False)), []
+    options = {
+        "features.max_keypoints": 200,
+        "refinement.enabled": False,
+        "loops.enabled": loops,
+    }
+    slam, results = Slam(CAMERA, SlamConfig().override(options)), []
     for index, (rgb, depth) in enumerate(views):
-        poses.append(tracker.track(rgb, depth, index / 30))
-        assert tracker._last is not None
-        from_last = tracker._motion.expected(index / 30).prior.T_cw @ inverse(tracker._last.T_cw)
+        results.append(slam.track(RGBDFrame(index / 30, rgb, depth)))
+        last = slam.tracker.state.last
+        prediction = slam.tracker.parts.motion.predict(index / 30)
+        assert last is not None
+        assert prediction is not None
+        from_last = prediction.prior.T_cw @ inverse(last.T_cw)
         assert np.linalg.norm(from_last[:3, 3]) < 0.01, index
-    return tracker, poses
+    return slam, results
 
 
 @pytest.fixture(scope="module")
 def closed(views: list[View]) -> Run:
+    """Track with loop closing."""
     return run(views, loops=True)
 
 
 @pytest.fixture(scope="module")
 def drifting(views: list[View]) -> Run:
+    """Track without loop closing."""
     return run(views, loops=False)
 
 
-def ate(tracker: Tracker) -> float:
-    """RMSE, m."""
-    return score(Trajectory(np.arange(FRAMES) / 30, TRUTH), Trajectory(*tracker.trajectory()))[
-        "ate_m"
-    ]["rmse"]
+def ate(slam: Slam) -> float:
+    """Return the RMSE of the absolute trajectory error, m."""
+    truth = Trajectory(np.arange(FRAMES) / 30, TRUTH)
+    rmse: float = score(truth, slam.trajectory())["ate_m"]["rmse"]
+    return rmse
 
 
-def test_closing_the_loop_takes_out_the_drift(drifting: Run, closed: Run) -> None:
-    assert all(pose.tracked for pose in closed[1])
-    assert (closed[0].loops, drifting[0].loops) == (1, 0)
+def test_closing_the_loop_removes_the_drift(drifting: Run, closed: Run) -> None:
+    assert all(result.is_tracked for result in closed[1])
+    assert (closed[0].num_loops, drifting[0].num_loops) == (1, 0)
     assert ate(drifting[0]) > 0.03
     assert ate(closed[0]) < 0.5 * ate(drifting[0])
 
 
-def test_the_camera_lands_on_the_closed_map_at_once(drifting: Run, closed: Run) -> None:
-    ends = [
-        poses[-1].T_wc @ inverse(inverse(TRUTH[0]) @ TRUTH[-1]) for _, poses in (drifting, closed)
-    ]
-    off = [float(np.linalg.norm(end[:3, 3])) for end in ends]
-    assert off[1] < 0.3 * off[0]
-    assert min(pose.inliers for pose in closed[1][-8:]) > 60
+def test_tracking_continues_on_the_corrected_map(drifting: Run, closed: Run) -> None:
+    true_end = inverse(TRUTH[0]) @ TRUTH[-1]
+    errors = []
+    for _, results in (drifting, closed):
+        error = results[-1].T_wc @ inverse(true_end)
+        errors.append(float(np.linalg.norm(error[:3, 3])))
+    assert errors[1] < 0.3 * errors[0]
+    assert min(result.num_matches for result in closed[1][-8:]) > 60
 
 
-def test_both_ends_of_a_loop_share_points(closed: Run) -> None:
-    world = closed[0].map
-    assert world.shared(world.keyframes[-1].seen_points(), world.keyframes[:6]).max() > 30
-    seen = [keyframe.seen_points() for keyframe in world.keyframes]
-    assert all(len(ids) == len(np.unique(ids)) for ids in seen), "a keyframe sees a point once"
-    counts = np.bincount(np.concatenate(seen), minlength=world.size)
-    np.testing.assert_array_equal(world.num_observations[: world.size], counts)
+def test_both_sides_of_a_loop_share_points(closed: Run) -> None:
+    point_map = closed[0].map
+    newest = point_map.keyframes[-1]
+    assert point_map.shared(newest.observed_point_ids(), point_map.keyframes[:6]).max() > 30
+    observed = [keyframe.observed_point_ids() for keyframe in point_map.keyframes]
+    assert all(len(ids) == len(np.unique(ids)) for ids in observed), "each point once per keyframe"
+    counts = np.bincount(np.concatenate(observed), minlength=point_map.size)
+    np.testing.assert_array_equal(point_map.num_observations[: point_map.size], counts)
 
 
-def left_over(world: Map) -> float:
-    """Mean of all measurements' squared residuals, in sigmas, each held to be 10 at most."""
+def mean_error(point_map: Map) -> float:
+    """Return the mean squared residual of all measurements, in sigmas, each clipped at 10."""
     squares = []
-    for keyframe in world.keyframes:
+    for keyframe in point_map.keyframes:
         keypoints = np.flatnonzero(keyframe.point_ids >= 0)
-        seen = observations(keyframe.features, keypoints)
-        squares.append(
-            chi_square(
-                keyframe.T_cw,
-                world.positions[keyframe.point_ids[keypoints]],
-                seen,
-                ReprojectionModel(CAMERA),
-            )
-        )
+        observed = observations(keyframe.features, keypoints)
+        points = point_map.positions[keyframe.point_ids[keypoints]]
+        squares.append(chi_square(keyframe.T_cw, points, observed, REPROJECTION))
     return float(np.minimum(np.concatenate(squares), 10.0).mean())
 
 
-def test_adjusting_everything_brings_displaced_keyframes_back(closed: Run) -> None:
-    """By more than half, and to where what is left over is no larger than before, within a
-    twentieth.
-    """
-    world = copy.deepcopy(closed[0].map)
-    adjust_everything(world, ReprojectionModel(CAMERA))
-    settled, best = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
+def poses(point_map: Map) -> np.ndarray:
+    """Return the poses of all keyframes [k, 4, 4]."""
+    return np.stack([keyframe.T_cw for keyframe in point_map.keyframes])
+
+
+def test_global_bundle_adjustment_corrects_displaced_keyframes(closed: Run) -> None:
+    """The displacement shrinks by half, and the error comes back to within a twentieth."""
+    point_map, config = copy.deepcopy(closed[0].map), BundleAdjustmentConfig()
+    adjust_everything(point_map, REPROJECTION, config)
+    settled, best = poses(point_map), mean_error(point_map)
+
     rng = np.random.default_rng(0)
-    for keyframe in world.keyframes[1:]:
+    for keyframe in point_map.keyframes[1:]:
         keyframe.T_cw = exp_se3(0.002 * rng.standard_normal(6)) @ keyframe.T_cw
-    displaced, worst = np.stack([keyframe.T_cw for keyframe in world.keyframes]), left_over(world)
-    adjust_everything(world, ReprojectionModel(CAMERA))
-    again = np.stack([keyframe.T_cw for keyframe in world.keyframes])
-    np.testing.assert_array_equal(again[0], settled[0])
-    assert np.abs(again - settled).mean() < 0.5 * np.abs(displaced - settled).mean()
-    assert left_over(world) - best < 0.05 * (worst - best), (best, worst, left_over(world))
+    displaced, worst = poses(point_map), mean_error(point_map)
+
+    adjust_everything(point_map, REPROJECTION, config)
+    adjusted, error = poses(point_map), mean_error(point_map)
+    np.testing.assert_array_equal(adjusted[0], settled[0])
+    assert np.abs(adjusted - settled).mean() < 0.5 * np.abs(displaced - settled).mean()
+    assert error - best < 0.05 * (worst - best), (best, worst, error)
 
 
-def test_the_end_of_a_run_adjusts_everything_unless_told_otherwise(views: list[View]) -> None:
-    poses = {}
-    for wanted in (True, False):
-        tracker = Tracker(CAMERA, features=250, method=Method(global_adjustment=wanted))
-        for index, (rgb, depth) in enumerate(views[:60]):
-            tracker.track(rgb, depth, index / 30)
-        before = tracker.trajectory()[1]
-        tracker.finish()
-        poses[wanted] = float(np.abs(tracker.trajectory()[1] - before).max())
-    assert poses[False] == 0.0
-    assert 0.0 < poses[True] < 0.05
+@pytest.mark.parametrize("is_enabled", [True, False])
+def test_finish_adjusts_all_keyframes_unless_disabled(views: list[View], is_enabled: bool) -> None:
+    options = {"features.max_keypoints": 250, "bundle_adjustment.global_enabled": is_enabled}
+    slam = Slam(CAMERA, SlamConfig().override(options))
+    for index, (rgb, depth) in enumerate(views[:60]):
+        slam.track(RGBDFrame(index / 30, rgb, depth))
+    before = slam.trajectory().poses
+    change = float(np.abs(slam.finish().poses - before).max())
+    assert (0.0 < change < 0.05) if is_enabled else change == 0.0
 
 
 @pytest.mark.slow
-def test_same_views_same_bits(views: list[View], closed: Run) -> None:
+def test_same_frames_give_the_same_bits(views: list[View], closed: Run) -> None:
     again, _ = run(views, loops=True)
-    assert again.trajectory()[1].tobytes() == closed[0].trajectory()[1].tobytes()
+    assert again.trajectory().poses.tobytes() == closed[0].trajectory().poses.tobytes()
 
 
 class TestVerification:
-    """The newest keyframe of the drifting run, which has come back to where the first ones were
-    taken.
-    """
+    """Verification of the newest keyframe of the drifting run, which has come back to the start."""
 
     @pytest.fixture
-    def pictures(self, views: list[View], drifting: Run) -> dict[int, DepthImage]:
+    def images(self, views: list[View], drifting: Run) -> dict[int, DepthImage]:
+        """Make the images of all keyframes."""
         return {
-            k.index: make_depth_image(*views[frame(k)], None, CAMERA)
-            for k in drifting[0].map.keyframes
+            keyframe.index: make_depth_image(*views[frame_number(keyframe)], None, CAMERA)
+            for keyframe in drifting[0].map.keyframes
         }
 
-    def verify(self, tracker: Tracker, pictures: dict[int, DepthImage]) -> Loop | None:
-        newest = tracker.map.keyframes[-1]
-        there = np.linalg.norm(TRUTH[:, :3, 3] - TRUTH[frame(newest), :3, 3], axis=1)
-        old = min(tracker.map.keyframes[:20], key=lambda k: float(there[frame(k)]))
-        return LoopVerifier(tracker.map, ReprojectionModel(CAMERA), np.random.default_rng(0))(
-            newest, old, pictures
-        )
+    def verify(self, slam: Slam, images: dict[int, DepthImage]) -> LoopConstraint | None:
+        """Verify a loop of the newest keyframe with the nearest of the first ones."""
+        newest = slam.map.keyframes[-1]
+        offset = TRUTH[:, :3, 3] - TRUTH[frame_number(newest), :3, 3]
+        distance = np.linalg.norm(offset, axis=1)
+        old = min(slam.map.keyframes[:20], key=lambda k: float(distance[frame_number(k)]))
+        rng = np.random.default_rng(0)
+        verifier = LoopVerifier(slam.map, REPROJECTION, LoopVerifierConfig(), rng)
+        return verifier.verify(newest, old, images)
 
-    def test_gives_the_true_motion_not_the_drifted_one(
-        self, drifting: Run, pictures: dict[int, DepthImage]
+    def test_loop_has_the_true_motion_rather_than_the_drifted_one(
+        self, drifting: Run, images: dict[int, DepthImage]
     ) -> None:
-        tracker = drifting[0]
-        loop = self.verify(tracker, pictures)
+        slam = drifting[0]
+        loop = self.verify(slam, images)
         assert loop is not None
-        assert loop.new[0] == tracker.map.keyframes[-1].index
+        assert loop.new[0] == slam.map.keyframes[-1].index
         assert len(loop.new) >= 3
         for index, T in zip(loop.new, loop.T, strict=True):
-            old, new = tracker.map.anchor(loop.old)[0], tracker.map.anchor(index)[0]
-            truth = inverse(TRUTH[frame(new)]) @ TRUTH[frame(old)]
-            off = np.linalg.norm((T @ inverse(truth))[:3, 3])
-            assert off < 0.02
-            assert off < 0.3 * np.linalg.norm(
-                (new.T_cw @ inverse(old.T_cw) @ inverse(truth))[:3, 3]
-            )
+            old, new = slam.map.anchor(loop.old)[0], slam.map.anchor(index)[0]
+            truth = inverse(TRUTH[frame_number(new)]) @ TRUTH[frame_number(old)]
+            drifted = new.T_cw @ inverse(old.T_cw)
+            error = np.linalg.norm((T @ inverse(truth))[:3, 3])
+            assert error < 0.02
+            assert error < 0.3 * np.linalg.norm((drifted @ inverse(truth))[:3, 3])
 
-    def test_neighbours_that_contradict_refuse_it(
-        self, drifting: Run, pictures: dict[int, DepthImage]
+    def test_contradicting_neighbors_reject_a_loop(
+        self, drifting: Run, images: dict[int, DepthImage]
     ) -> None:
         keyframes = drifting[0].map.keyframes[-6:-1]
         before = [keyframe.T_cw for keyframe in keyframes]
         for keyframe in keyframes:
             keyframe.T_cw = exp_se3(np.array([0.1, 0, 0, 0, 0, 0])) @ keyframe.T_cw
         try:
-            assert self.verify(drifting[0], pictures) is None
+            assert self.verify(drifting[0], images) is None
         finally:
             for keyframe, T_cw in zip(keyframes, before, strict=True):
                 keyframe.T_cw = T_cw
 
-    def test_pictures_that_contradict_refuse_it(
-        self, drifting: Run, pictures: dict[int, DepthImage]
+    def test_contradicting_images_reject_a_loop(
+        self, drifting: Run, images: dict[int, DepthImage]
     ) -> None:
         keyframes = drifting[0].map.keyframes
-        wrong = pictures | {keyframes[-1].index: pictures[keyframes[len(keyframes) // 2].index]}
+        other = keyframes[len(keyframes) // 2]
+        wrong = images | {keyframes[-1].index: images[other.index]}
         assert self.verify(drifting[0], wrong) is None
 
 
-def frame(keyframe: Keyframe) -> int:
-    """The number of the view that a keyframe is."""
-    return round(30 * keyframe.t)
+def frame_number(keyframe: Keyframe) -> int:
+    """Return the number of the frame that a keyframe was made of."""
+    return round(30 * keyframe.timestamp)

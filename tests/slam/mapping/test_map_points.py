@@ -5,7 +5,7 @@ from plane_world import CAMERA, features_at
 
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.map_points import cull, drop_points
+from cohdc_train.slam.mapping.map_points import cull_map_points, remove_points
 
 ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them
 
@@ -30,16 +30,16 @@ def test_what_a_point_has_become() -> None:
         world.add_keyframe(frames[index])
         world.add_points(frames[index], np.array([0]))
     everything, ids = np.arange(3), [np.array([index]) for index in range(3)]
-    np.testing.assert_array_equal(world.current(everything), everything)
+    np.testing.assert_array_equal(world.resolve_merged(everything), everything)
     world.replace(ids[2], ids[1], frames)
     world.replace(ids[1], ids[0], frames)
-    np.testing.assert_array_equal(world.current(everything), [0, 0, 0])
+    np.testing.assert_array_equal(world.resolve_merged(everything), [0, 0, 0])
     for frame in frames[:3]:
         world.forget(frame, np.flatnonzero(frame.point_ids == 0))
     world.add_keyframe(frames[3])
     world.add_points(frames[3], np.array([1]))
     assert frames[3].point_ids[1] == 0
-    np.testing.assert_array_equal(world.current(everything), [0, 1, 1])
+    np.testing.assert_array_equal(world.resolve_merged(everything), [0, 1, 1])
 
 
 def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
@@ -50,9 +50,9 @@ def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
     world.add_keyframe(second)
     world.add_points(second, np.array([YOUNG]))
     world.visible[[TWICE, RARELY_FOUND]], world.found[[TWICE, RARELY_FOUND]] = 20, (5, 4)
-    cull(world, newest=2)
+    cull_map_points(world, newest=2)
     assert world.num_observations[: world.size].tolist() == [1, 2, 0, 1], "its time is not up"
-    cull(world, newest=3)
+    cull_map_points(world, newest=3)
     assert world.num_observations[: world.size].tolist() == [0, 2, 0, 1]
     assert first.point_ids.tolist() == [-1, TWICE, -1, -1]
 
@@ -69,7 +69,7 @@ def test_dropped_point_leaves_every_keyframe_however_many_saw_it() -> None:
     for other in keyframes[1:]:
         world.add_keyframe(other)
     assert world.num_observations[0] == 12
-    drop_points(world, np.array([0]))
+    remove_points(world, np.array([0]))
     assert world.num_observations[0] == 0
     assert all(other.point_ids[0] == -1 for other in keyframes)
 

@@ -9,6 +9,7 @@ from plane_world import CAMERA
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
+from cohdc_train.slam.config import RansacConfig
 from cohdc_train.slam.geometry.se3 import exp_se3, skew, to_local
 from cohdc_train.slam.optimization.bundle_adjustment import (
     Problem,
@@ -29,6 +30,7 @@ from cohdc_train.slam.optimization.reprojection import (
 )
 
 Array = NDArray[np.float64]
+RANSAC = RansacConfig()
 REPROJECTION = ReprojectionModel(CAMERA)
 
 
@@ -123,7 +125,7 @@ def test_ransac_survives_sixty_percent_outliers() -> None:
     T_cw, points = exp_se3(np.array([0.3, -0.2, 0.1, 0.1, -0.2, 0.3])), cloud(rng, 150)
     seen = observe(T_cw, points, rng, noise=0.2)
     seen.pixels[:90] = rng.uniform([0, 0], [320, 240], size=(90, 2))
-    found = ransac_pose(points, seen, CAMERA, np.random.default_rng(0), hypotheses=256)
+    found = ransac_pose(points, seen, CAMERA, np.random.default_rng(0), RANSAC, hypotheses=256)
     assert found is not None
     assert found[1][90:].mean() > 0.9
     assert found[1][:90].mean() < 0.1
@@ -135,8 +137,8 @@ def test_ransac_without_depth_falls_back_on_the_guess() -> None:
     rng = np.random.default_rng(3)
     points = cloud(rng, 20)
     seen = Observations(CAMERA.project(points), np.full(20, np.nan), np.ones(20), np.ones(20))
-    assert ransac_pose(points, seen, CAMERA, rng) is None
-    found = ransac_pose(points, seen, CAMERA, rng, guess=np.eye(4))
+    assert ransac_pose(points, seen, CAMERA, rng, RANSAC) is None
+    found = ransac_pose(points, seen, CAMERA, rng, RANSAC, guess=np.eye(4))
     assert found is not None
     assert found[1].all()
 
@@ -190,7 +192,10 @@ def test_schur_bundle_adjustment_equals_a_general_solver() -> None:
 def test_bundle_adjustment_tells_outliers_and_leaves_fixed_poses() -> None:
     true_poses, _, poses, points, problem = small_problem(5, outliers=6)
     new_poses, new_points = adjust(poses, points, problem, REPROJECTION, steps=20)
-    good = measurement_chi2(new_poses, new_points, problem, REPROJECTION) <= problem.seen.limits
+    good = (
+        measurement_chi2(new_poses, new_points, problem, REPROJECTION)
+        <= problem.seen.chi2_thresholds
+    )
     assert not good[:6].any()
     assert good[6:].all()
     new_poses, _ = adjust(

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import logm
 
+from cohdc_train.slam.config import LoopConfig
 from cohdc_train.slam.geometry.se3 import exp_se3, inverse, log_se3
 from cohdc_train.slam.optimization.pose_graph import (
     Edges,
@@ -95,7 +96,7 @@ def test_jacobians_equal_differences(seed: int) -> None:
 def test_loops_take_out_the_drift(seed: int) -> None:
     truth = square()
     drifted, edges = graph(truth, np.random.default_rng(seed), rounds(len(truth)))
-    solved, weights = optimize_graph(drifted, edges)
+    solved, weights = optimize_graph(drifted, edges, LoopConfig())
     # What is left is the noise of one lap; two laps without a loop carry much more.
     exact = Edges(
         edges.first,
@@ -104,7 +105,9 @@ def test_loops_take_out_the_drift(seed: int) -> None:
         edges.sigmas,
         edges.robust,
     )
-    assert error(optimize_graph(drifted, exact)[0], truth) < 1e-3 * error(drifted, truth)
+    assert error(optimize_graph(drifted, exact, LoopConfig())[0], truth) < 1e-3 * error(
+        drifted, truth
+    )
     assert error(solved, truth) < 0.5 * error(drifted, truth)
     assert weights[edges.robust].min() > 0.3
     np.testing.assert_array_equal(solved[0], drifted[0])
@@ -125,7 +128,7 @@ def test_one_closing_of_a_square_takes_out_a_drift_in_yaw() -> None:
         np.tile(SIGMA, (last + 1, 1)),
         np.arange(last + 1) == last,
     )
-    solved, _ = optimize_graph(poses, edges)
+    solved, _ = optimize_graph(poses, edges, LoopConfig())
     assert error(poses, truth) > 0.2
     assert error(solved, truth) < error(poses, truth) / 5
 
@@ -141,10 +144,12 @@ def test_a_wrong_loop_is_outweighed() -> None:
         np.concatenate([right.sigmas, SIGMA[None]]),
         np.r_[right.robust, True],
     )
-    solved, weights = optimize_graph(drifted, wrong)
+    solved, weights = optimize_graph(drifted, wrong, LoopConfig())
     assert weights[-1] < 1e-3
     assert weights[right.robust.nonzero()[0]].min() > 0.3
-    assert error(solved, truth) < 1.1 * error(optimize_graph(drifted, right)[0], truth)
+    assert error(solved, truth) < 1.1 * error(
+        optimize_graph(drifted, right, LoopConfig())[0], truth
+    )
 
 
 def test_edges_refuse_shapes_that_differ() -> None:

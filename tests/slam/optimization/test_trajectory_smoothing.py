@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plane_world import CAMERA, camera_path, render, room
+from plane_world import CAMERA, camera_path, render, room, slam_config, track
 
-from cohdc_train.slam.config import Method
+from cohdc_train.slam.config import MotionModelConfig, SmoothingConfig
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
-from cohdc_train.slam.optimization import trajectory_smoothing as smoothing
 from cohdc_train.slam.optimization.reprojection import Prior
-from cohdc_train.slam.optimization.trajectory_smoothing import smoothed
-from cohdc_train.slam.tracking.motion_model import ACCELERATION
-from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.optimization.trajectory_smoothing import TrackedPoses, smooth_trajectory
+from cohdc_train.slam.system import Slam
+
+MOTION = MotionModelConfig()
+ACCELERATION = np.repeat(MOTION.acceleration_sigma, 3)
 
 
 def noisy(
@@ -32,6 +33,12 @@ def noisy(
 def alone(stamps: Array, poses: Array, information: Array) -> Array:
     """Smoothed, where nothing was expected of any frame."""
     return smoothed(stamps, poses, information, np.zeros((len(poses), 6)))
+
+
+def smoothed(stamps: Array, poses: Array, information: Array, gradients: Array) -> Array:
+    """Smoothed with the default options."""
+    tracked = TrackedPoses(stamps, poses, information, gradients)
+    return smooth_trajectory(tracked, SmoothingConfig(), MOTION)
 
 
 def off(poses: Array, truth: Array) -> float:
@@ -79,10 +86,10 @@ def test_it_is_the_least_squares_of_what_was_seen_and_of_changes_of_velocity(see
         np.concatenate(rows).reshape(-1, 6 * n), np.concatenate(right), rcond=None
     )[0]
     wanted = exp_se3(small.reshape(n, 6)) @ measured
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(smoothing, "_ROUNDS", 1)  # the first, in which all changes weigh alike
-        patch.setattr(smoothing, "_LEAST_SHARE", 1.0)  # and frames know what they say
-        np.testing.assert_allclose(alone(stamps, measured, information), wanted, atol=1e-7)
+    # One iteration, in which all changes count alike, and information as the frames state it.
+    config = SmoothingConfig(iterations=1, min_variance_ratio=1.0)
+    tracked = TrackedPoses(stamps, measured, information, np.zeros((n, 6)))
+    np.testing.assert_allclose(smooth_trajectory(tracked, config, MOTION), wanted, atol=1e-7)
 
 
 def test_a_knock_is_rounded_off_for_a_moment_only() -> None:
@@ -111,7 +118,7 @@ def test_what_was_expected_is_taken_out_again() -> None:
     prior = Prior(expected, information[15])
     drawn, pulls = measured.copy(), np.zeros((30, 6))
     drawn[15] = exp_se3(0.5 * log_se3(expected @ inverse(measured[15]))) @ measured[15]
-    pulls[15] = prior.pull(drawn[15])
+    pulls[15] = prior.gradient(drawn[15])
     seen = alone(stamps, measured, information)
     taken_out = np.abs(smoothed(stamps, drawn, information, pulls) - seen).max()
     assert taken_out < 3e-4
@@ -172,9 +179,9 @@ def test_the_tracker_smooths_its_trajectory_unless_told_not_to() -> None:
     views = [render(room(), pose)[:2] for pose in path]
     ways, live = [], []
     for smooths in (True, False):
-        tracker = Tracker(CAMERA, features=300, method=Method(smoothing=smooths))
-        live.append([tracker.track(*view, k / 30).T_wc for k, view in enumerate(views)])
-        ways.append(tracker.trajectory()[1])
+        slam = Slam(CAMERA, slam_config(300, smoothing__enabled=smooths))
+        live.append([track(slam, *view, k / 30).T_wc for k, view in enumerate(views)])
+        ways.append(slam.trajectory().poses)
     np.testing.assert_array_equal(live[0], live[1])
     assert 1e-5 < np.abs(ways[0] - ways[1]).max() < 0.02
     true = inverse(path)

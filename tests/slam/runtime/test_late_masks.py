@@ -1,4 +1,4 @@
-"""tools/experiments/late_masks.py: real time without a clock."""
+"""tools/experiments/late_masks.py: real time without a clock, so that results repeat."""
 
 import json
 import sys
@@ -8,10 +8,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from plane_world import write_sequence
+from plane_world import slam_config, write_sequence
 from tool_loader import load_tool
 
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.run import slam
 
 
@@ -21,28 +21,26 @@ def tool() -> ModuleType:
 
 
 def square(frame: int) -> NDArray[np.bool_]:
-    """Which frame a mask was made of shows in where it is."""
+    """Return a mask whose place tells the frame that it was made for."""
     mask = np.zeros((240, 640), dtype=np.bool_)
     mask[100:140, 60 * frame + 20 : 60 * frame + 60] = True
     return mask
 
 
-@pytest.mark.parametrize(("late", "made_of"), [(0, range(8)), (2, [0, 0, 0, 1, 1, 3, 3, 5])])
-def test_a_mask_is_of_the_latest_frame_that_is_done(
-    tool: ModuleType, late: int, made_of: list[int]
+@pytest.mark.parametrize(("late", "made_for"), [(0, range(8)), (2, [0, 0, 0, 1, 1, 3, 3, 5])])
+def test_mask_is_that_of_the_latest_finished_frame(
+    tool: ModuleType, late: int, made_for: list[int]
 ) -> None:
-    """The picture stands still, so that a mask stays where it was made. The segmenter takes the
-    next that comes.
-    """
+    """The scene is static, so that a mask stays in its place."""
     gray = np.random.default_rng(0).integers(0, 255, (240, 640, 1)).astype(np.uint8)
     rgb, depth = gray.repeat(3, axis=2), np.full((240, 640), 2.0, dtype=np.float32)
     masks = tool.LateMasks(lambda view: (square(int(view.name)), 0.0), late)
-    for frame, wanted in enumerate(made_of):
-        mask = masks(View(frame / 30, str(frame), str(frame), rgb, depth))
+    for frame, wanted in enumerate(made_for):
+        mask = masks(RGBDFrame(frame / 30, rgb, depth, name=str(frame)))
         assert np.flatnonzero(mask[120, 40::60][:8]).tolist() == [wanted], frame
 
 
-def test_without_flow_and_in_time_it_is_the_synchronous_run(
+def test_run_without_delay_and_flow_equals_the_synchronous_run(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = write_sequence(tmp_path / "plane", 12, with_passer_by=True)
@@ -57,14 +55,14 @@ def test_without_flow_and_in_time_it_is_the_synchronous_run(
         "0",
         "2",
     ]
-    monkeypatch.setattr(sys, "argv", ["late_masks", *words, "--method", "flow=false"])
+    monkeypatch.setattr(sys, "argv", ["late_masks", *words, "--settings", "flow.enabled=false"])
     tool.main()
     rows = json.loads((tmp_path / "out" / "late_masks.json").read_text())
     assert [(row["sequence"], row["late"], row["features"]) for row in rows] == [
         ("plane", 0, 400),
         ("plane", 2, 400),
     ]
-    run = slam(sequence=sequence, out=tmp_path / "run", masks=sequence / "masks", features=400)
+    run = slam(sequence, out=tmp_path / "run", masks=sequence / "masks", settings=slam_config(400))
     assert rows[0]["ate_m"] == pytest.approx(run["ate_m"]["rmse"], rel=1e-3)
     assert (
         f"| plane | 0 | {rows[0]['ate_m']:.4f} |"
@@ -73,7 +71,7 @@ def test_without_flow_and_in_time_it_is_the_synchronous_run(
 
 
 @pytest.mark.parametrize("gone", ["groundtruth.txt", "rgb.txt"])
-def test_a_sequence_that_cannot_be_used_is_one_line(
+def test_unusable_sequence_is_an_error_of_one_line(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: str
 ) -> None:
     (write_sequence(tmp_path / "plane", 4) / gone).unlink()

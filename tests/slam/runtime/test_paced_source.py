@@ -1,6 +1,4 @@
-"""Views at the pace of their stamps, without a clock: what is late is dropped and counted, nothing
-queues.
-"""
+"""Frames at the pace of their timestamps, with a clock that the test sets."""
 
 import threading
 from collections.abc import Iterator
@@ -10,14 +8,14 @@ import pytest
 from plane_world import CAMERA
 
 from cohdc_train.errors import DataError
-from cohdc_train.slam.frame import View
+from cohdc_train.slam.frame import RGBDFrame
 from cohdc_train.slam.runtime.latest_slot import LatestSlot
 from cohdc_train.slam.runtime.paced_source import PacedSource
 
-LONG = 20.0  # s: no wait of a thread here takes that long unless it hangs
+TIMEOUT_S = 20.0  # of a wait for a thread, which is over long before
 
 
-def test_a_slot_holds_the_newest_and_counts_the_rest() -> None:
+def test_slot_holds_the_newest_item_and_counts_dropped_ones() -> None:
     slot: LatestSlot[int] = LatestSlot()
     assert slot.poll() is None
     for number in range(1000):
@@ -27,63 +25,59 @@ def test_a_slot_holds_the_newest_and_counts_the_rest() -> None:
     assert slot.poll() is None
     slot.put(7)
     slot.close()
-    assert slot.take() == 7, "what was there when it closed is still given"
+    assert slot.take() == 7, "an item from before the end can be taken"
     assert slot.take() is None
 
 
-def test_a_slot_closed_with_an_error_raises_it_where_it_is_read() -> None:
+def test_slot_raises_the_error_it_was_closed_with() -> None:
     slot: LatestSlot[int] = LatestSlot()
     slot.close(DataError("broken.png: not an image"))
     with pytest.raises(DataError, match=r"broken\.png"):
         slot.take()
 
 
-def view(index: int) -> View:
-    t, size = 100 + index / 30, (CAMERA.height, CAMERA.width)
-    return View(
-        t,
-        f"{t:.6f}",
-        f"{index}",
-        np.zeros((*size, 3), dtype=np.uint8),
-        np.zeros(size, dtype=np.float32),
-    )
+def make_frame(index: int) -> RGBDFrame:
+    """Return a black frame of a camera with 30 frames per second, named by its number."""
+    size = (CAMERA.height, CAMERA.width)
+    rgb, depth = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
+    return RGBDFrame(100 + index / 30, rgb, depth, name=f"{index}")
 
 
-class Gated:
-    """A source that makes a view when it is let; `asked` tells how many views have been asked for."""
+class GatedSource:
+    """Source that makes a frame when it is allowed to; requested: number of requested frames."""
 
-    camera, groundtruth, without_depth = CAMERA, None, 0
+    camera, groundtruth, num_unpaired = CAMERA, None, 0
 
     def __init__(self, count: int, broken: int | None = None) -> None:
         self.count, self.broken = count, broken
         self.allowed = threading.Semaphore(0)
-        self.asked = 0
+        self.requested = 0
         self.changed = threading.Condition()
 
     def __len__(self) -> int:
         return self.count
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         for index in range(self.count + 1):
             with self.changed:
-                self.asked += 1
+                self.requested += 1
                 self.changed.notify_all()
-            assert self.allowed.acquire(timeout=LONG)
+            assert self.allowed.acquire(timeout=TIMEOUT_S)
             if index == self.broken:
                 raise DataError("7.png: broken")
             if index < self.count:
-                yield view(index)
+                yield make_frame(index)
 
-    def let(self, views: int) -> None:
-        """Make so many views, and wait until the reader comes for the one after."""
+    def allow(self, num_frames: int) -> None:
+        """Make some frames, and wait until the reader requests the one after."""
         with self.changed:
-            goal = self.asked + views
-            self.allowed.release(views)
-            assert self.changed.wait_for(lambda: self.asked >= goal, LONG)
+            goal = self.requested + num_frames
+            self.allowed.release(num_frames)
+            assert self.changed.wait_for(lambda: self.requested >= goal, TIMEOUT_S)
 
 
-class Still:
-    """A clock that goes only when it is told to."""
+class ManualClock:
+    """Clock that the test sets."""
 
     def __init__(self) -> None:
         self.time = 0.0
@@ -96,76 +90,79 @@ class Still:
         self.waits.append(moment)
 
 
-def test_an_answer_ends_the_latency_and_the_time_until_the_next_view_is_spent() -> None:
-    source, clock = Gated(3), Still()
+def test_answer_ends_the_latency_and_frame_time_elapses() -> None:
+    source, clock = GatedSource(3), ManualClock()
     source.allowed.release(2)
-    spent = []
+    frame_time_used = []
     with PacedSource(source, clock) as paced:
         for taken in paced:
-            assert paced.spent() <= 0
+            assert paced.frame_time_used() <= 0
             if taken.name == "1":
-                source.let(1)
+                source.allow(1)
             if taken.name == "2":
                 clock.time = 2.2 / 30
-                paced.answered()
+                paced.mark_answered()
                 for moment in (2.45, 2.55):
                     clock.time = moment / 30
-                    spent.append(paced.spent())
+                    frame_time_used.append(paced.frame_time_used())
                 source.allowed.release()
-    np.testing.assert_allclose(spent, [0.45, 0.55])
+    np.testing.assert_allclose(frame_time_used, [0.45, 0.55])
     np.testing.assert_allclose(
         paced.latencies, [-1 / 30, 0.2 / 30], atol=1e-9
-    )  # the clock stood still for the first
+    )  # the clock did not move during the first
 
 
-def test_views_that_come_while_the_tracker_is_busy_are_dropped_and_counted() -> None:
-    source, clock = Gated(9), Still()
+def test_frames_are_dropped_and_counted_while_tracking_is_busy() -> None:
+    source, clock = GatedSource(9), ManualClock()
     source.allowed.release(2)
-    given = []
+    names = []
     with PacedSource(source, clock) as paced:
         for taken in paced:
-            given.append(int(taken.name))
-            if given == [0, 1]:
-                source.let(5)
-                clock.time += 0.2  # views 2..6 come in this time
-            elif given[-1] == 6:
+            names.append(int(taken.name))
+            if names == [0, 1]:
+                source.allow(5)
+                clock.time += 0.2  # frames 2..6 come in this time
+            elif names[-1] == 6:
                 source.allowed.release(3)
-    assert given[:3] == [0, 1, 6]
-    assert paced.dropped == 9 - len(given)
+    assert names[:3] == [0, 1, 6]
+    assert paced.dropped == 9 - len(names)
     assert paced.dropped >= 4
     np.testing.assert_allclose(clock.waits, np.arange(1, 9) / 30, atol=1e-9)
     np.testing.assert_allclose(paced.latencies[0], 0.2 - 1 / 30, atol=1e-9)
-    assert len(paced.latencies) == len(given) - 1
+    assert len(paced.latencies) == len(names) - 1
 
 
 class SlowToRead:
-    """Four views that take 0.1 s each to make."""
+    """Source of four frames that take 0.1 s each to read."""
 
-    camera, groundtruth, without_depth = CAMERA, None, 0
+    camera, groundtruth, num_unpaired = CAMERA, None, 0
 
-    def __init__(self, clock: Still) -> None:
+    def __init__(self, clock: ManualClock) -> None:
         self.clock = clock
 
     def __len__(self) -> int:
         return 4
 
-    def __iter__(self) -> Iterator[View]:
+    def __iter__(self) -> Iterator[RGBDFrame]:
         for index in range(4):
             self.clock.time += 0.1
-            yield view(index)
+            yield make_frame(index)
 
 
-def test_reading_slower_than_the_recording_delays_it_instead_of_piling_up() -> None:
-    clock = Still()
+def test_slow_reading_delays_playback() -> None:
+    clock = ManualClock()
     with PacedSource(SlowToRead(clock), clock) as paced:
         given = list(paced)
-    assert paced.behind == pytest.approx(3 * (0.1 - 1 / 30))
+    assert paced.playback_delay_s == pytest.approx(3 * (0.1 - 1 / 30))
     np.testing.assert_allclose(clock.waits, [0.2, 0.3, 0.4])
     assert len(given) + paced.dropped == 4
 
 
-def test_a_broken_image_ends_the_run_with_its_error() -> None:
-    source = Gated(9, broken=3)
+def test_broken_image_ends_the_run_with_its_error() -> None:
+    source = GatedSource(9, broken=3)
     source.allowed.release(9)
-    with PacedSource(source, Still()) as paced, pytest.raises(DataError, match=r"7\.png: broken"):
+    with (
+        PacedSource(source, ManualClock()) as paced,
+        pytest.raises(DataError, match=r"7\.png: broken"),
+    ):
         list(paced)

@@ -1,6 +1,4 @@
-"""A run shown in rerun: recorded without a window, read back by rerun's own tool; and what happens
-without it.
-"""
+"""Recording of a run for rerun, read with rerun's own tool; and runs without rerun."""
 
 import subprocess
 import sys
@@ -14,24 +12,24 @@ from cohdc_train.cli import main
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten frames with a passer-by."""
+    """Write a sequence of ten frames with a passer-by."""
     return write_sequence(tmp_path_factory.mktemp("view") / "walk", 10, with_passer_by=True)
 
 
 def arguments(sequence: Path, out: Path) -> list[str]:
+    """Return the command line of a small run with masks."""
     words = [
         "slam",
-        "--sequence",
         str(sequence),
         "--masks",
         str(sequence / "masks"),
         "--out",
         str(out),
     ]
-    return [*words, "--features", "400"]
+    return [*words, "--settings.features.max_keypoints", "400"]
 
 
-def test_a_recording_holds_camera_image_mask_map_way_and_times(
+def test_recording_holds_camera_image_mask_map_path_and_times(
     sequence: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk comes with the view extra")
@@ -50,7 +48,7 @@ def test_a_recording_holds_camera_image_mask_map_way_and_times(
         "world/camera/image",
         "world/camera/mask",
         "world/points",
-        "world/way",
+        "world/trajectory",
         "ms/track",
         "ms/segment",
         "inliers",
@@ -66,16 +64,18 @@ def test_a_recording_holds_camera_image_mask_map_way_and_times(
         assert f"\n{component}: " in stats, component
 
 
-def test_a_recording_of_a_run_that_fails_is_not_left(sequence: Path, tmp_path: Path) -> None:
+def test_recording_of_a_failed_run_is_removed(sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk comes with the view extra")
     words = [*arguments(sequence, tmp_path / "run"), "--rrd", str(tmp_path / "run.rrd")]
-    words[words.index("--masks") + 1] = str(sequence / "depth")  # no file of the masks' names
+    words[words.index("--masks") + 1] = str(
+        sequence / "depth"
+    )  # has no files with the names of the masks
     assert main(words) == 1
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("option", [["--view"], ["--rrd", "run.rrd"]])
-def test_without_rerun_the_command_that_installs_it_is_named(
+@pytest.mark.parametrize("option", [["--viewer"], ["--rrd", "run.rrd"]])
+def test_missing_rerun_is_an_error_with_the_install_command(
     sequence: Path,
     tmp_path: Path,
     option: list[str],
