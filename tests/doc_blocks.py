@@ -8,10 +8,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
+import option_reference
+
 from cohdc_train.cli import COMMANDS, main
+from cohdc_train.errors import CohdcError
+from cohdc_train.presets import config_path
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+
 _BLOCK = re.compile(
     r"(?:^<!-- (?P<marker>[^\n]*?) -->\n)?^```(?P<language>[a-z]*)\n(?P<text>.*?)^```$",
     flags=re.DOTALL | re.MULTILINE,
@@ -85,3 +90,30 @@ def check(words: list[str]) -> int:
             return main(words)
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else 2
+
+
+@functools.cache
+def fit_parser() -> Any:
+    """Return the parser of `cohdc fit`, which Lightning builds in seconds."""
+    return option_reference.parser_of("fit")
+
+
+def check_fit(words: list[str]) -> int:
+    """Parse the words after `cohdc fit`, without files of the reader; returns the exit code."""
+    arguments = list(words)
+    while arguments and not arguments[0].startswith("-"):
+        arguments.pop(0)  # folders of data
+    kept: list[str] = []
+    for word in arguments:
+        if kept and kept[-1] == "--config":
+            try:
+                word = str(config_path(word))
+            except CohdcError:  # a file of the reader
+                kept.pop()
+                continue
+        kept.append(word)
+    try:
+        fit_parser().parse_args(kept)
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else 2
+    return 0
