@@ -102,9 +102,7 @@ def run_slam_three_times(out: Path, seed: int) -> dict[str, Any]:
     shutil.rmtree(out / "slam", ignore_errors=True)
     (out / "slam").mkdir()
     with _processes() as pool:
-        jobs = {
-            name: pool.submit(track, out, name, seed) for name in ("plain", "geometry")
-        }
+        jobs = {name: pool.submit(track, out, name, seed) for name in ("plain", "geometry")}
         metrics = {name: job.result() for name, job in jobs.items()}
     metrics["masks"] = track(out, "masks", seed)
     return metrics
