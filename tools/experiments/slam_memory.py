@@ -9,7 +9,7 @@ Frames come at 30 a second, images a --shrink-th as wide and high; they are read
 A line every --every frames: resident memory beyond that before the first frame, keyframes and
 points the map holds, keyframes made since the line before, and CPU time per frame. Results go to
 OUT as `cohdc slam` writes them; the truth goes forth and back, too. Rolling shutter and the time
-between colour and depth are left out, for they would be wrong on the way back.
+between color and depth are skipped, for they would be wrong on the way back.
 """
 
 import argparse
@@ -109,7 +109,7 @@ def shrunk(camera: Camera, by: int) -> Camera:
 
 
 def small(view: RGBDFrame, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, and depth as it is stored."""
+    """Color, and depth as it is stored."""
     rgb = cv2.resize(view.rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return rgb, np.rint(view.depth[by // 2 :: by, by // 2 :: by] * camera.depth_scale).astype(
         np.uint16
