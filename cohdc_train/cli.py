@@ -3,12 +3,15 @@
 A command's module is imported when the command is called, so that `cohdc --help` costs nothing.
 """
 
+import functools
 import importlib
+import inspect
 import re
 import sys
 from collections.abc import Collection, Container, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple, NoReturn
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, get_args, get_origin
 
 from cohdc_train.errors import CohdcError, MissingExtraError
 
@@ -21,12 +24,14 @@ class Command(NamedTuple):
         attribute: typed function in it, or a dict of them: subcommand -> function.
         summary: line of `cohdc --help`.
         default: subcommand that a group without subcommands became, for the hint in an error.
+        has_page: whether the command writes report.html into its output folder at the end.
     """
 
     module: str
     attribute: str
     summary: str
     default: str | None = None
+    has_page: bool = False
 
 
 COMMANDS = {
@@ -41,7 +46,12 @@ COMMANDS = {
     "synth": Command(
         "synth", "COMMANDS", "render COCO-format sets and TUM-format sequences with walking people"
     ),
-    "fit": Command("train.cli", "fit", "train an HDC Mask R-CNN with CQE on a COCO-format folder"),
+    "fit": Command(
+        "train.cli",
+        "fit",
+        "train an HDC Mask R-CNN with CQE on a COCO-format folder",
+        has_page=True,
+    ),
     "validate": Command(
         "validation", "validate", "score a checkpoint or an ONNX file on a COCO-format folder"
     ),
@@ -57,13 +67,16 @@ COMMANDS = {
         "repeat the paper's tables: networks (4), tum (5 to 7, no torch), table3",
         default="networks",
     ),
-    "slam": Command("slam.run", "slam", "track an RGB-D sequence, with people removed (no torch)"),
+    "slam": Command(
+        "slam.run",
+        "slam",
+        "track an RGB-D sequence, with people removed (no torch)",
+        has_page=True,
+    ),
     "evaluate": Command(
         "trajectory.evaluate", "evaluate", "score a trajectory against ground truth: ATE and RPE"
     ),
-    "report": Command(
-        "report", "report", "make an HTML page of a SLAM run: scores, trajectory, times, images"
-    ),
+    "report": Command("report", "report", "make an HTML page of a run, or of several side by side"),
     "env": Command("env", "env", "print installed versions, and what is wrong with them"),
 }
 
@@ -124,18 +137,41 @@ def _call(name: str, args: list[str]) -> None:
         module = importlib.import_module(f"cohdc_train.{command.module}")
         component = getattr(module, command.attribute)
         if name == "fit":  # Lightning's own command line, which reads the arguments itself
-            component(args)
+            trainer = component(args)
+            if trainer.is_global_zero:
+                _write_page(Path(trainer.default_root_dir))
             return
         if isinstance(component, dict):
             _check_subcommand(name, args, component)
         renamed = getattr(module, "RENAMED_OPTIONS", {})
-        _run_function(component, args, f"cohdc {name}", renamed)
+        function = _with_page(component) if command.has_page else component
+        _run_function(function, args, f"cohdc {name}", renamed)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
             raise
         fix = "pip install 'cohdc-train[train]'"
         raise MissingExtraError(f"{name} needs {package}, which is not installed: {fix}") from error
+
+
+def _with_page(function: Any) -> Any:
+    """Return a command's function that writes the page of its output folder at the end."""
+
+    @functools.wraps(function)
+    def run(**options: Any) -> Any:
+        result = function(**options)
+        _write_page(options["out"])
+        return result
+
+    return run
+
+
+def _write_page(folder: Path) -> None:
+    """Write report.html of a run. An error in it is printed and does not fail the run."""
+    try:
+        importlib.import_module("cohdc_train.report").report([folder])
+    except CohdcError as error:
+        print(f"no report: {error}", file=sys.stderr)
 
 
 def _check_subcommand(name: str, args: Sequence[str], group: Collection[str]) -> None:
@@ -201,6 +237,16 @@ def _short_usage(prog: str, actions: Sequence[Any]) -> str:
     return " ".join([prog, *words, "[options]"])
 
 
+def _positional_lists(function: Any) -> dict[str, Any]:
+    """Return name -> type of an item, of parameters that are lists without a default."""
+    parameters = inspect.signature(function).parameters.values()
+    return {
+        parameter.name: get_args(parameter.annotation)[0]
+        for parameter in parameters
+        if get_origin(parameter.annotation) is list and parameter.default is parameter.empty
+    }
+
+
 def _run_function(component: Any, args: list[str], prog: str, renamed: Mapping[str, str]) -> None:
     """Run a typed function, or one of a dict of them, with options read from its signature.
 
@@ -213,15 +259,21 @@ def _run_function(component: Any, args: list[str], prog: str, renamed: Mapping[s
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
     switches: set[str] = set()
+    lists = {} if isinstance(component, dict) else _positional_lists(component)
 
     class Parser(ArgumentParser):
         """Parser for which a switch needs no value: `--quick`, `--no_quick` and `--quick=true`.
 
         A switch inside a group needs one: `--settings.loops.enabled false`. jsonargparse copies
-        add_argument for groups without its scope, so that it may use `switches` for others only.
+        add_argument for groups without its scope, so that it may use `switches` and `lists` for
+        others only. A required list takes several words: RUN [RUN ...].
         """
 
         def add_argument(self, *names: Any, **kwargs: Any) -> Any:
+            if not names[0].startswith("-") and names[0] in lists:
+                metavar = names[0].removesuffix("s").upper()
+                kwargs = {"type": lists[names[0]], "nargs": "+", "help": kwargs["help"]}
+                kwargs["metavar"] = metavar
             if kwargs.get("type") is bool and names[0].startswith("--") and "." not in names[0]:
                 switches.add(names[0])
                 del kwargs["type"]

@@ -18,10 +18,10 @@ from cohdc_train.files import check_folder, claim_folder, write_json
 from cohdc_train.metrics.coco_metrics import Results, SegmentationMetrics
 from cohdc_train.presets import model_path
 from cohdc_train.segmenter import Segmenter
-from cohdc_train.train.cli import told_in_one_line
 from cohdc_train.train.malloc import keep_freed_memory
+from cohdc_train.train.messages import user_errors
 from cohdc_train.train.module import MaskRCNNModule
-from cohdc_train.train.validation_figures import VALIDATION_FILES, draw_validation, write_files
+from cohdc_train.train.validation_figures import VALIDATION_FILES, draw_validation, write_figures
 
 RENAMED_OPTIONS = {"--pictures": "--figures"}
 
@@ -90,7 +90,7 @@ def validate(
         write_json(out, results.scores)
     if figures is not None:
         claim_folder(figures, "validate", VALIDATION_FILES, "--figures")
-        write_files(figures, draw_validation(results, split.images))
+        write_figures(figures, draw_validation(results, split.images))
     return results.scores
 
 
@@ -173,7 +173,7 @@ def score_module(
         module.rescore = options.rescore
     module.min_quality = options.min_quality
     precision: Any = options.precision
-    with told_in_one_line():
+    with user_errors():
         trainer = Trainer(
             logger=False,
             enable_checkpointing=False,

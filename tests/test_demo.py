@@ -66,7 +66,7 @@ def test_the_report_needs_no_other_file(finished):
     page = (finished / "report.html").read_text()
     assert page.count("data:image/") >= 10
     assert 'src="http' not in page
-    assert "Absolute trajectory error" in page
+    assert "Translation error (ATE)" in page
 
 
 def test_a_folder_of_something_else_is_not_touched(tmp_path):

@@ -113,6 +113,9 @@ def test_options_get_the_names_that_the_checkout_knows() -> None:
     assert checkout.translate(command, old) == command
     renamed = ["--dense_cloud", "true", "--settings.features.max_keypoints", "800"]
     assert checkout.translate(command, new) == ["slam", *renamed, "--seed", "0"]
+    assert checkout.translate(["fit", "--pictures=false"], "--figures F") == [
+        *("fit", "--figures=false")
+    ]
     newest = new.replace("--seed", "--settings.seed")
     command = ["slam", "--sequence", "walk", *command[1:]]
     translated = ["slam", "walk", *renamed, "--settings.seed", "0"]

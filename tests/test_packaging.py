@@ -4,12 +4,16 @@ import json
 import os
 import subprocess
 import sys
+import tarfile
+import tomllib
 import venv
+import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 from tool_loader import load_tool
 
 from cohdc_train.trajectory.trajectory import Trajectory
@@ -83,7 +87,8 @@ class Clean:
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Clean:
     folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)]
+    # The source distribution first, and the wheel from it: both hold everything, or this fails.
+    build = [sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = folder.glob("cohdc_train-*.whl")
     environment = Clean(folder)
@@ -120,6 +125,36 @@ def test_wheel_holds_the_configurations(clean: Clean) -> None:
     assert clean.run("python", "-c", code) == "".join(
         (ROOT / "configs" / name).read_text() for name in names
     )
+
+
+@pytest.mark.slow
+def test_wheel_holds_every_file_of_the_package(clean: Clean) -> None:
+    (wheel,) = clean.folder.glob("cohdc_train-*.whl")
+    held = set(zipfile.ZipFile(wheel).namelist())
+    package = [path for path in (ROOT / "cohdc_train").rglob("*") if path.is_file()]
+    wanted = {str(p.relative_to(ROOT)) for p in package if "__pycache__" not in p.parts}
+    assert {"cohdc_train/shipped/person.onnx", "cohdc_train/py.typed"} <= wanted
+    assert wanted - held == set()
+
+
+@pytest.mark.slow
+def test_wheel_detects_with_a_shipped_network_in_an_empty_folder(clean: Clean) -> None:
+    elsewhere = clean.folder / "elsewhere"
+    cv2.imwrite(str(elsewhere / "wall.png"), np.full((120, 160, 3), 90, np.uint8))
+    clean.run("cohdc", "predict", "wall.png", "--model", "person", "--out", "detected")
+    found = json.loads((elsewhere / "detected" / "predictions.json").read_text())
+    assert [category["name"] for category in found["categories"]] == ["person"]
+    assert "--sequence" in clean.run("cohdc", "slam", "--help")
+
+
+@pytest.mark.slow
+def test_source_distribution_holds_what_the_tests_need(clean: Clean) -> None:
+    (sdist,) = clean.folder.glob("cohdc_train-*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    wanted = {"docs/conf.py", "tests/test_docs.py", "configs/person.yaml", "docker/compose.yaml"}
+    assert wanted <= held
+    assert not [name for name in held if name.startswith("docs/_build")]
 
 
 @pytest.mark.slow
@@ -172,7 +207,44 @@ def test_dockerfile_copies_what_exists_and_pins(dockerfile: Path) -> None:
     ]
     assert installs
     assert all("-c constraints.txt" in argument for argument in installs)
-    assert any("[train]" in argument for argument in installs) == (dockerfile.stem == "train")
+    assert any("[train]" in argument for argument in installs) == ("train" in dockerfile.stem)
+
+
+@pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.stem)
+def test_dockerfile_ends_as_a_user_without_root_rights(dockerfile: Path) -> None:
+    steps = load_tool("../.ci/check_docker").instructions(dockerfile)
+    users = [argument for instruction, argument in steps if instruction == "USER"]
+    assert users == ["cohdc"]
+    assert ("FROM", "python:3.11-slim") in steps
+
+
+def test_docker_context_holds_what_the_files_copy_and_no_more() -> None:
+    lines = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    allowed = {line[1:] for line in lines if line.startswith("!")}
+    copied = set()
+    for dockerfile in DOCKERFILES:
+        for instruction, argument in load_tool("../.ci/check_docker").instructions(dockerfile):
+            copied |= set(argument.split()[:-1]) if instruction == "COPY" else set()
+    assert "*" in lines
+    assert copied == allowed
+
+
+def test_compose_file_names_the_dockerfiles() -> None:
+    services = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())["services"]
+    built = {Path(service["build"]["dockerfile"]).name for service in services.values()}
+    assert built == {path.name for path in DOCKERFILES}
+
+
+@pytest.mark.slow
+def test_base_installation_has_wheels_for_aarch64(tmp_path: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    platforms = ("manylinux2014_aarch64", "manylinux_2_27_aarch64", "manylinux_2_28_aarch64")
+    install = [sys.executable, "-m", "pip", "install", "--dry-run", "-q", "--ignore-installed"]
+    install += ["--target", str(tmp_path), "--only-binary=:all:", "--python-version", "3.11"]
+    install += [f"--platform={platform}" for platform in platforms]
+    install += ["-c", str(ROOT / "constraints.txt"), *project["dependencies"]]
+    done = subprocess.run(install, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_checker_follows_a_dockerfile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

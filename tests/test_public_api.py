@@ -32,7 +32,7 @@ TINY = {
     "trainer.accelerator": "cpu",
     "trainer.precision": "32-true",
     "trainer.enable_progress_bar": False,
-    "pictures": False,
+    "figures": False,
 }
 
 

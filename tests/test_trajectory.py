@@ -328,6 +328,10 @@ def test_evaluate_prints_and_writes_the_same_numbers(
         tmp_path / "truth.txt", tmp_path / "estimate.txt", out=tmp_path / "new" / "scores.json"
     )
     stored = json.loads((tmp_path / "new" / "scores.json").read_text())
+    names = {"groundtruth": "truth.txt", "estimate": "estimate.txt"}
+    assert {key: stored.pop(key) for key in names} == {
+        k: str(tmp_path / n) for k, n in names.items()
+    }
     assert stored == result
     assert set(stored) == {
         "ate_m",

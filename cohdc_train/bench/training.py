@@ -70,7 +70,7 @@ def train(
         f"--out={folder}",
         "--data.workers=0",
         "--trainer.limit_val_batches=0",
-        "--pictures=false",
+        "--figures=false",
         "--trainer.enable_progress_bar=false",
     ]
     start = time.monotonic()

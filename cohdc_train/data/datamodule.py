@@ -151,7 +151,14 @@ class CocoDataModule(pl.LightningDataModule):
             train = tuple(split.subset(self.subset.train) for split in whole.train)
             self._folder = CocoFolder(train, whole.val.subset(self.subset.val))
             if self.overfit:
-                same = train[0].without_empty_images().subset(self.overfit)
+                usable = train[0].without_empty_images()
+                num_usable = len(usable.images)
+                if self.overfit > num_usable:
+                    raise DataError(
+                        f"--overfit {self.overfit}: {usable.annotations} has {num_usable} training "
+                        f"images with objects; give at most {num_usable}"
+                    )
+                same = usable.subset(self.overfit)
                 self._folder = CocoFolder((same,), same)
         return self._folder
 

@@ -1,5 +1,4 @@
-"""Contour quality evaluation (paper 2.1.2): a head that regresses how well a predicted mask covers
-its object.
+"""Contour quality evaluation (paper 2.1.2): a head that regresses the IoU of predicted masks.
 
 The paper feeds the true contour to the head; at inference there is none, so the truth enters
 through the target only.
@@ -15,10 +14,9 @@ Fusion = Literal["concat", "multiply", "add"]
 
 
 class CQEHead(nn.Module):
-    """Four 3x3 convolutions and three fully connected layers (paper 2.1.2) over an RoI feature and
-    a predicted mask.
+    """Head of four 3x3 convolutions and three fully connected layers over RoI feature and mask.
 
-    How the two meet:
+    `fusion` decides how the two are joined (paper 2.1.2):
     - "concat": the mask, max-pooled to the feature's size, is one more channel (Mask Scoring
       R-CNN);
     - "multiply": the feature is multiplied by the max-pooled mask (paper, Fig. 5, first structure);
@@ -32,7 +30,7 @@ class CQEHead(nn.Module):
         channels: width of the convolutions (paper: 256).
         fc: width of the first two fully connected layers (paper: 1024).
         roi_size: side of the RoI feature, cells.
-        fusion: see above.
+        fusion: "concat", "multiply" or "add".
     """
 
     def __init__(
@@ -44,6 +42,7 @@ class CQEHead(nn.Module):
         roi_size: int = 14,
         fusion: Fusion = "concat",
     ) -> None:
+        """Build the layers."""
         super().__init__()
         self.fusion = fusion
         widths = [in_channels + (fusion == "concat"), channels, channels, channels, channels]
@@ -69,17 +68,23 @@ class CQEHead(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
-        """features: [K, C, 14, 14]; masks: [K, M, M] probabilities of one class, M a multiple of
-        28.
+        """Predict the quality of masks.
 
-        Returns [K, num_classes], linear.
+        Args:
+            features: [K, C, 14, 14].
+            masks: [K, M, M] probabilities of one class, M a multiple of 28.
+
+        Returns:
+            [K, num_classes], linear.
         """
         quality: Tensor = self.quality(self.fcs(self.convs(self.fuse(features, masks)).flatten(1)))
         return quality
 
     def fuse(self, features: Tensor, masks: Tensor) -> Tensor:
-        """What the convolutions see: [K, C + 1, 14, 14], [K, C, 14, 14] or [K, C, 28, 28], as
-        `fusion` says.
+        """Join feature and mask to the input of the convolutions.
+
+        Returns [K, C + 1, 14, 14] for "concat", [K, C, 14, 14] for "multiply", [K, C, 28, 28] for
+        "add".
         """
         scale = masks.shape[-1] // features.shape[-1]
         if self.fusion == "add":
@@ -92,11 +97,12 @@ class CQEHead(nn.Module):
 
 
 def cqe_loss(quality: Tensor, labels: Tensor, targets: Tensor) -> Tensor:
-    """Half the mean squared error over RoIs with a target above 0.
+    """Compute half the mean squared error over RoIs with a target above 0.
 
-    quality: [K, num_classes]; labels: [K] 0-based class; targets: [K]. Without such a RoI the loss
-    is a zero that still reaches every parameter, so that no rank of a distributed run waits for
-    another.
+    Without such a RoI the loss is a zero that still reaches every parameter, so that no rank of a
+    distributed run waits for another.
+
+    quality: [K, num_classes]; labels: [K] class from 0; targets: [K].
     """
     valid = targets > 0
     if not bool(valid.any()):

@@ -14,7 +14,7 @@ class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not
     """BatchNorm whose statistics, scale and shift are constants.
 
     Torchvision's makes two passes over the map, and turns it into float32 in mixed precision; this
-    makes one.
+    class makes one.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ class FrozenNorm(FrozenBatchNorm2d):  # type: ignore[misc]  # torchvision is not
 
 
 class AppliedNorm(FrozenNorm):
-    """Frozen norm that the convolution before it has applied already."""
+    """Frozen norm that the convolution before it has applied already; returns its input."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Return x."""
@@ -33,13 +33,13 @@ class AppliedNorm(FrozenNorm):
 
 
 class FoldingConv2d(nn.Conv2d):
-    """Convolution that applies the frozen norm behind it: its weights are scaled before every pass.
+    """Convolution that applies the frozen norm behind it: its weights are scaled before each pass.
 
-    That costs nothing next to a pass over the map, and the weights and the norm keep their names
-    and values.
+    That costs nothing compared with a pass over the map, and the weights and the norm keep their
+    names and values.
     """
 
-    norms: list[FrozenNorm]  # one; a list, so that it is no submodule of this too
+    norms: list[FrozenNorm]  # one norm, in a list, so that it is no submodule here
 
     def forward(self, x: Tensor) -> Tensor:
         """Convolve and normalize x [B, C, H, W]."""
@@ -51,10 +51,8 @@ class FoldingConv2d(nn.Conv2d):
         return F.conv2d(x, weight, bias, self.stride, self.padding, self.dilation, self.groups)
 
 
-def conv_norm_pairs(network: nn.Module) -> Iterator[tuple[nn.Module, str, str]]:
-    """Yield every convolution with a norm right behind it: the module that has both, and their
-    names in it.
-    """
+def conv_bn_pairs(network: nn.Module) -> Iterator[tuple[nn.Module, str, str]]:
+    """Yield each convolution with a norm behind it: the module that has both, and their names."""
     for module in network.modules():
         for (name, first), (norm_name, second) in pairwise(module.named_children()):
             if isinstance(first, nn.Conv2d) and hasattr(second, "running_mean"):
@@ -62,8 +60,8 @@ def conv_norm_pairs(network: nn.Module) -> Iterator[tuple[nn.Module, str, str]]:
 
 
 def apply_norms_in_convolutions(network: nn.Module) -> None:
-    """Have every convolution with a frozen norm behind it apply that norm itself, in place."""
-    for module, name, norm_name in conv_norm_pairs(network):
+    """Make each convolution with a frozen norm behind it apply that norm itself, in place."""
+    for module, name, norm_name in conv_bn_pairs(network):
         convolution, norm = getattr(module, name), getattr(module, norm_name)
         if isinstance(norm, FrozenNorm):
             convolution.__class__ = FoldingConv2d
@@ -72,7 +70,7 @@ def apply_norms_in_convolutions(network: nn.Module) -> None:
 
 
 def plain_convolution(convolution: nn.Conv2d) -> nn.Conv2d:
-    """Return the convolution as one that applies no norm, changed in place."""
+    """Turn a convolution in place into one that applies no norm, and return it."""
     if isinstance(convolution, FoldingConv2d):
         del convolution.norms
         convolution.__class__ = nn.Conv2d  # type: ignore[assignment]
@@ -80,7 +78,5 @@ def plain_convolution(convolution: nn.Conv2d) -> nn.Conv2d:
 
 
 def fold_batch_norm(convolution: nn.Conv2d, norm: Any) -> nn.Conv2d:
-    """Return a convolution, without a norm, of which the result is that of the two in evaluation
-    mode.
-    """
+    """Return a convolution that computes what convolution and norm compute in evaluation mode."""
     return fuse_conv_bn_eval(plain_convolution(convolution), norm)

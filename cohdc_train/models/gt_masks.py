@@ -1,6 +1,4 @@
-"""Ground-truth masks as the losses want them: whole masks of the canvas, or mini-masks of one
-object each.
-"""
+"""Ground-truth masks for the losses: masks of the whole canvas, or mini-masks of one object."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,32 +11,36 @@ from torchvision.ops import roi_align
 
 
 @dataclass(frozen=True)
-class TrueMasks:
-    """The masks of one image's objects, each a raster over a frame; outside of its frame an object
-    has no pixel.
+class GroundTruthMasks:
+    """Masks of one image's objects, each a raster over a frame, with no pixel outside of it.
 
     Attributes:
         rasters: [G, h, w] share of each cell that the object covers, 0..1, of any dtype.
-        frames: float32 [G, 4] xyxy, canvas px: what each raster covers; the canvas, or a
-            mini-mask's box.
+        frames: float32 [G, 4] xyxy, canvas px: what each raster covers; the canvas, or the box of a
+            mini-mask.
     """
 
     rasters: Tensor
     frames: Tensor
 
     def __post_init__(self) -> None:
+        """Check the shapes."""
         if self.rasters.ndim != 3 or self.frames.shape != (len(self.rasters), 4):
             raise ValueError(
-                f"rasters {list(self.rasters.shape)} and frames {list(self.frames.shape)} do not agree"
+                f"rasters {list(self.rasters.shape)} and frames {list(self.frames.shape)} "
+                "do not agree"
             )
 
     @classmethod
-    def of(cls, target: Mapping[str, Any], chosen: Tensor) -> "TrueMasks":
-        """Objects `chosen` [K] of a training target: `masks`, with `frames` when they are
-        mini-masks.
+    def from_target(cls, target: Mapping[str, Any], chosen: Tensor) -> "GroundTruthMasks":
+        """Select objects of a training target.
 
         A mini-mask gets a ring of empty cells: RoIAlign repeats a raster's last cell just outside
         of it.
+
+        Args:
+            target: `masks`, with `frames` when they are mini-masks.
+            chosen: [K] indices of objects.
         """
         rasters = target["masks"][chosen]
         if "frames" in target:
@@ -50,22 +52,28 @@ class TrueMasks:
         return cls(rasters, canvas.expand(len(rasters), 4))
 
     def cells(self) -> Tensor:
-        """[G, 2] width and height, in canvas px, of a raster's cell."""
+        """Return [G, 2] width and height of a raster's cell, canvas px."""
         side = self.frames.new_tensor([self.rasters.shape[2], self.rasters.shape[1]])
         return (self.frames[:, 2:] - self.frames[:, :2]) / side
 
     def areas(self) -> Tensor:
-        """[G] px^2 of the whole objects."""
+        """Return [G] areas of the whole objects, px^2."""
         area: Tensor = self.rasters.to(self.frames.dtype).sum(dim=(1, 2)) * self.cells().prod(dim=1)
         return area
 
-    def within(
+    def coverage(
         self, boxes: Tensor, matched: Tensor, size: tuple[int, int], samples: int = 0
     ) -> Tensor:
-        """[K, *size]: share of each cell of a grid over its box that the object covers.
+        """Compute the share of each cell of a grid over a box that the object covers.
 
-        boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object; samples: per cell
-        and axis, 0 takes every cell of the raster that the grid's cell meets.
+        Args:
+            boxes: [K, 4] xyxy, canvas px.
+            matched: [K] index of each box's object.
+            size: (rows, columns) of the grid.
+            samples: per cell and axis; 0 takes all cells of the raster that the grid's cell meets.
+
+        Returns:
+            [K, rows, columns] in 0..1.
         """
         frames, cells = self.frames[matched], self.cells()[matched].repeat(1, 2)
         rois = (boxes - frames[:, :2].repeat(1, 2)) / cells

@@ -1,17 +1,16 @@
-"""Hybrid dilated convolution: which rates leave no hole (paper 2.1.1, eq. 1). Plain integers, no
-tensors.
-"""
+"""Hybrid dilated convolution: dilation rates that leave no hole (paper 2.1.1, eq. 1)."""
 
 from collections.abc import Sequence
 
 
 def max_distance(rates: Sequence[int]) -> int:
-    """M_2 of eq. 1: the largest distance between two non-zeros that reach the second layer; M_1 for
-    a single layer.
+    """Compute M_2 of eq. 1: the largest distance between two non-zeros that reach the second layer.
 
-    rates: dilation per layer, first layer first. The paper omits the boundary condition M_n = r_n.
-    It asks for M_2 <= K, which is neither necessary nor sufficient (2, 2, 2 passes and leaves
-    holes): `holes` decides, this is reported beside it.
+    The paper omits the boundary condition M_n = r_n. It asks for M_2 <= K, which is neither
+    necessary nor sufficient (2, 2, 2 passes and leaves holes): `holes` decides, and this value is
+    reported with it.
+
+    rates: dilation per layer, first layer first. Returns M_1 for a single layer.
     """
     distance = rates[-1]
     for rate in reversed(rates[1:-1]):
@@ -20,18 +19,15 @@ def max_distance(rates: Sequence[int]) -> int:
 
 
 def receptive_field(rates: Sequence[int], kernel: int = 3) -> int:
-    """Side, in pixels of the first layer's input, of what one output pixel sees through stacked
-    stride-1 layers.
-    """
+    """Return the side of the receptive field of stacked stride-1 layers, px of the input."""
     return 2 * sum(rates) * (kernel // 2) + 1
 
 
 def holes(rates: Sequence[int], kernel: int = 3) -> list[int]:
-    """Offsets inside the receptive field, in pixels along one axis, that no path through the layers
-    reaches.
+    """Return the offsets inside the receptive field that no path through the layers reaches.
 
-    A dilated kernel is separable in its support, so that one axis tells all. Empty when the
-    coverage is whole.
+    Offsets are pixels along one axis: the support of a dilated kernel is separable, so that one
+    axis is enough. Empty when the receptive field is covered.
     """
     reached = {0}
     for rate in rates:
@@ -41,10 +37,11 @@ def holes(rates: Sequence[int], kernel: int = 3) -> list[int]:
     return [offset for offset in range(-half, half + 1) if offset not in reached]
 
 
-def cycle(pattern: Sequence[int], layers: int) -> tuple[int, ...]:
-    """`pattern` repeated over `layers` convolutions and checked.
+def cycle_rates(pattern: Sequence[int], layers: int) -> tuple[int, ...]:
+    """Repeat a pattern of rates over so many layers, and check that they leave no hole.
 
-    Raises ValueError that names the holes when the convolutions do not cover their receptive field.
+    Raises:
+        ValueError: a rate is below 1, or the layers leave holes; the message names them.
     """
     if not pattern or any(rate < 1 for rate in pattern):
         raise ValueError(
@@ -53,9 +50,10 @@ def cycle(pattern: Sequence[int], layers: int) -> tuple[int, ...]:
     rates = tuple(pattern[i % len(pattern)] for i in range(layers))
     missing = holes(rates)
     if missing:
-        named = ", ".join(str(offset) for offset in missing if offset > 0)
+        offsets = ", ".join(str(offset) for offset in missing if offset > 0)
         raise ValueError(
-            f"HDC rates {rates} leave holes: offsets +-({named}) px of a field of {receptive_field(rates)} px are "
-            f"never seen (eq. 1: M_2 = {max_distance(rates)}, K = 3)"
+            f"HDC rates {rates} leave holes: offsets +-({offsets}) px of a field of "
+            f"{receptive_field(rates)} px are never seen "
+            f"(eq. 1: M_2 = {max_distance(rates)}, K = 3)"
         )
     return rates

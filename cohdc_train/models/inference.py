@@ -1,5 +1,4 @@
-"""The padded forward: from uint8 images to a fixed number of detections, the same code in torch and
-in the export.
+"""Inference with a fixed number of padded detections, the same code in torch and in the export.
 
 Rows that hold no detection are zeros behind `count`; only the others go through the mask and CQE
 heads.
@@ -12,15 +11,15 @@ from torch import Tensor
 
 from cohdc_train.models.mask_rcnn import MaskRCNN
 from cohdc_train.models.ops import letterbox, nms_keep, roi_pool_levels, rows_to_segment
-from cohdc_train.models.rpn import decode, is_solid
+from cohdc_train.models.rpn import decode, is_nonempty
 
 _CANDIDATES = 1000  # best (proposal, class) pairs that enter the last suppression
-_LEAST_IOU = 0.25  # that a mask is cut by: at a probability of 0.2
+_MIN_IOU = 0.25  # lowest IoU estimate that a mask is cut by, at a probability of 0.2
 
 
 @dataclass(frozen=True)
 class PaddedDetections:
-    """The output tensors in the order of `cohdc_train.signature.OUTPUTS`, of which they are."""
+    """Output tensors, in the order of `cohdc_train.signature.OUTPUTS`."""
 
     boxes: Tensor
     labels: Tensor
@@ -31,20 +30,25 @@ class PaddedDetections:
 
 
 class Detector(torch.nn.Module):
-    """A MaskRCNN as the function that is exported: uint8 images [B, H, W, 3] RGB -> the outputs of
-    `cohdc_train.signature`, in its order.
-    """
+    """MaskRCNN as it is exported: from images to the outputs of `cohdc_train.signature`."""
 
     def __init__(self, network: MaskRCNN) -> None:
+        """Wrap a network in evaluation mode."""
         super().__init__()
         self.network = network
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        """images: uint8 [B, H, W, 3] RGB, any H and W. Rows of the result fall by score."""
+        """Detect objects; rows of the result are sorted by score.
+
+        images: uint8 [B, H, W, 3] RGB, any H and W.
+        """
         return self.on_canvas(*letterbox(images, *self.network.config.canvas))
 
     def on_canvas(self, canvas: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
-        """The same of what `letterbox` has made of them."""
+        """Detect objects on images that `letterbox` has fitted into the canvas.
+
+        canvas, geometry: the results of `letterbox`.
+        """
         found = detect_on_canvas(
             self.network, canvas, geometry[None, :2].expand(canvas.shape[0], 2)
         )
@@ -54,11 +58,15 @@ class Detector(torch.nn.Module):
 
 @torch.no_grad()
 def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
-    """Detections of images of any sizes, each in its own pixels.
+    """Detect objects in images of any sizes, each in its own pixels.
 
-    images: uint8 [3, H, W] RGB. Returns per image `boxes` [n, 4] xyxy px, `labels` [n] 0-based,
-    `scores` [n], `quality` [n], `masks` [n, M, M] probabilities inside the box. The network should
-    be in evaluation mode.
+    Args:
+        network: a network in evaluation mode.
+        images: uint8 [3, H, W] RGB.
+
+    Returns:
+        Per image `boxes` [n, 4] xyxy px, `labels` [n] from 0, `scores` [n], `quality` [n], `masks`
+        [n, M, M] probabilities inside the box.
     """
     rows, columns = network.config.canvas
     fitted = [letterbox(image.permute(1, 2, 0)[None], rows, columns) for image in images]
@@ -76,8 +84,9 @@ def detect(network: MaskRCNN, images: list[Tensor]) -> list[dict[str, Tensor]]:
 
 
 def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> PaddedDetections:
-    """canvas: float [B, 3, H, W] in 0..1; content: [B, 2] height and width in px of what is not
-    padding.
+    """Detect objects on a batch of fitted images; boxes are in canvas px.
+
+    canvas: float [B, 3, H, W] in 0..1; content: [B, 2] height and width of what is not padding, px.
     """
     pyramid = network.features(canvas)
     limit = content.flip(1).repeat(1, 2)[:, None]  # [B, 1, 4]: x, y, x, y
@@ -93,7 +102,11 @@ def detect_on_canvas(network: MaskRCNN, canvas: Tensor, content: Tensor) -> Padd
 def _classify(
     network: MaskRCNN, levels: list[Tensor], proposals: Tensor, limit: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Boxes [B, N, 4], 0-based labels [B, N], scores [B, N] falling, count [B]; padded with zeros."""
+    """Classify proposals and suppress overlapping boxes.
+
+    Returns boxes [B, N, 4], labels [B, N] from 0, scores [B, N] in falling order, count [B]; padded
+    with zeros.
+    """
     config, heads = network.config, network.roi_heads
     batch, rois = proposals.shape[:2]
     images = torch.arange(batch, device=proposals.device).repeat_interleave(rois)
@@ -105,7 +118,9 @@ def _classify(
     scores = logits.float().softmax(dim=1)[:, 1:].reshape(batch, rois * classes)
     deltas = deltas.float().reshape(batch, rois * (classes + 1), 4)
     solid = (
-        is_solid(proposals)[:, :, None].expand(batch, rois, classes).reshape(batch, rois * classes)
+        is_nonempty(proposals)[:, :, None]
+        .expand(batch, rois, classes)
+        .reshape(batch, rois * classes)
     )
     scores, index = torch.where(solid, scores, 0.0).topk(min(_CANDIDATES, rois * classes), dim=1)
     roi, label = index // classes, index % classes
@@ -116,7 +131,7 @@ def _classify(
         heads.box_coder.weights,
         limit,
     )
-    scores = torch.where(is_solid(boxes), scores, 0.0)
+    scores = torch.where(is_nonempty(boxes), scores, 0.0)
     apart = label.float() * (max(config.canvas) + 1.0)  # no two classes overlap
     keep = nms_keep(boxes + apart[:, :, None], scores, config.nms_iou, config.score_threshold)
     scores, best = torch.where(keep, scores, 0.0).topk(
@@ -130,8 +145,9 @@ def _classify(
 def _segment(
     network: MaskRCNN, levels: list[Tensor], boxes: Tensor, labels: Tensor, count: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Masks [B, N, M, M] and quality [B, N] of the predicted classes; zeros in rows at or behind
-    count [B].
+    """Predict mask and quality of the predicted classes.
+
+    Returns masks [B, N, M, M] and quality [B, N]; zeros from row count [B] on.
     """
     heads = network.roi_heads
     batch, n = labels.shape
@@ -163,12 +179,14 @@ def _segment(
 
 
 def cut_by_quality(masks: Tensor, quality: Tensor) -> Tensor:
-    """Masks [n, M, M] of probabilities, moved so that 0.5 is the cut of the greatest expected IoU.
+    """Rescale mask probabilities so that 0.5 is the cut of the greatest expected IoU.
 
-    quality: [n] estimates q of the IoU. A pixel of probability p that joins a mask adds p to its
-    intersection with the object and 1 - p to their union. That raises their ratio where p / (1 - p)
-    exceeds it, so the cut lies at q / (1 + q): at 0.5 for a perfect mask, lower for one in doubt,
-    whose doubtful rim rather belongs to it than not.
+    A pixel of probability p that joins a mask adds p to its intersection with the object and 1 - p
+    to their union. That raises their ratio where p / (1 - p) exceeds it, so the cut lies at q / (1
+    + q): at 0.5 for a perfect mask, lower for an uncertain one, whose uncertain rim rather belongs
+    to it.
+
+    masks: [n, M, M] probabilities; quality: [n] estimates q of the IoU.
     """
-    ratio = quality.clamp(min=_LEAST_IOU)[:, None, None]
+    ratio = quality.clamp(min=_MIN_IOU)[:, None, None]
     return masks / (masks + ratio * (1.0 - masks))

@@ -1,4 +1,4 @@
-"""The mask head's end, 28 or 56 cells a side, and its loss."""
+"""The last layers of the mask head, for masks of 28 or 56 cells a side, and its loss."""
 
 from collections import OrderedDict
 from typing import Literal
@@ -7,14 +7,15 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from torchvision.models.detection.mask_rcnn import MaskRCNNPredictor
 
-from cohdc_train.models.gt_masks import TrueMasks
+from cohdc_train.models.gt_masks import GroundTruthMasks
 
 MaskSize = Literal[28, 56]
 
 
 def mask_predictor(channels: int, classes: int, side: MaskSize) -> nn.Sequential:
-    """Features [K, channels, 14, 14] -> logits [K, classes, side, side]: torchvision's; 56 takes
-    one more step.
+    """Build torchvision's layers from features to logits; 56 cells take one more deconvolution.
+
+    They map [K, channels, 14, 14] to [K, classes, side, side].
     """
     once: nn.Sequential = MaskRCNNPredictor(channels, channels, classes)
     if side == 28:
@@ -28,15 +29,19 @@ def mask_predictor(channels: int, classes: int, side: MaskSize) -> nn.Sequential
     )
 
 
-def mask_loss(logits: Tensor, truth: TrueMasks, boxes: Tensor, matched: Tensor) -> Tensor:
-    """Binary cross-entropy of masks [K, M, M] (logits) with the share of every cell that the object
-    covers.
+def mask_loss(logits: Tensor, truth: GroundTruthMasks, boxes: Tensor, matched: Tensor) -> Tensor:
+    """Compute the binary cross-entropy of masks with the share of each cell that the object covers.
 
-    boxes: [K, 4] xyxy, canvas px; matched: [K] index of each box's object. The targets are soft and
-    lie on the grid by which masks are pasted; Matterport's are rounded, torchvision's half a pixel
-    off.
+    The targets are soft and lie on the grid by which masks are pasted; Matterport's are rounded,
+    torchvision's half a pixel off.
+
+    Args:
+        logits: [K, M, M] of the object's class.
+        truth: masks of the objects.
+        boxes: [K, 4] xyxy, canvas px.
+        matched: [K] index of each box's object.
     """
     if not len(boxes):
         return logits.sum() * 0
-    covered = truth.within(boxes, matched, (logits.shape[-2], logits.shape[-1]))
+    covered = truth.coverage(boxes, matched, (logits.shape[-2], logits.shape[-1]))
     return F.binary_cross_entropy_with_logits(logits, covered)

@@ -6,17 +6,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from cohdc_train.models.backbone import (
-    MEAN,
-    STD,
-    Norm,
-    Rates,
-    StagedBackbone,
-    load_weights,
-    norm_layer,
-    read_weights,
-    rounded,
-)
+from cohdc_train.models.backbone import MEAN, STD, Backbone, Norm, Rates, norm_layer, round_channels
+from cohdc_train.models.backbone_weights import load_weights, read_weights
 
 _EPS = 1e-3  # TensorFlow's, with which the published weights were trained
 _BLOCKS = (
@@ -34,8 +25,9 @@ _STAGES = ((0, 3), (3, 5), (5, 11), (11, 13))  # blocks of each stage: strides 4
 
 
 class _ConvNorm(nn.Module):
-    """Convolution, norm, ReLU6; a stride of 2 pads below and right only, as TensorFlow does with
-    even sides.
+    """Convolution, norm and ReLU6.
+
+    A stride of 2 pads below and right only, as TensorFlow does with even sides.
     """
 
     def __init__(self, conv: nn.Conv2d, norm: nn.Module) -> None:
@@ -49,7 +41,7 @@ class _ConvNorm(nn.Module):
 
 
 class _Separable(nn.Module):
-    """A depthwise 3x3 and a pointwise convolution."""
+    """Depthwise 3x3 convolution and pointwise convolution."""
 
     def __init__(
         self, channels: int, out: int, stride: int, norm: Callable[[int], nn.Module]
@@ -65,12 +57,12 @@ class _Separable(nn.Module):
         return out
 
 
-class MobileNetV1(StagedBackbone):
+class MobileNetV1(Backbone):
     """MobileNetV1 whose depthwise convolutions may follow a dilation pattern inside each stage.
 
-    The tensors' names are `stem.{conv,bn}` and `blocks.N.{dw,pw}.{conv,bn}`; weights are those of
-    TensorFlow's network, which takes pixels in -1..1: the input is brought there from ImageNet's
-    normalisation.
+    The tensors' names are `stem_block.{conv,bn}` and `blocks.N.{dw,pw}.{conv,bn}`; weights are
+    those of TensorFlow's network, which takes pixels in -1..1: the input is brought there from
+    ImageNet's normalization.
 
     Args:
         width: channels as a share of the network's (32 to 1024), rounded to multiples of 8.
@@ -79,7 +71,7 @@ class MobileNetV1(StagedBackbone):
         frozen_stages: how many of the stem and the stages are not trained.
 
     Raises:
-        ValueError: as `StagedBackbone.finish`.
+        ValueError: as `Backbone.init_stages`.
     """
 
     scale: Tensor
@@ -92,32 +84,42 @@ class MobileNetV1(StagedBackbone):
         norm: Norm = "batch",
         frozen_stages: int = 0,
     ) -> None:
+        """Build the layers."""
         super().__init__()
         make_norm = norm_layer(norm, _EPS)
-        channels = rounded(32 * width)
+        channels = round_channels(32 * width)
         self.stem_block = _ConvNorm(nn.Conv2d(3, channels, 3, 2, bias=False), make_norm(channels))
         self.blocks = nn.ModuleList()
         for out, stride in _BLOCKS:
-            self.blocks.append(_Separable(channels, rounded(out * width), stride, make_norm))
-            channels = rounded(out * width)
-        self.out_channels = [rounded(_BLOCKS[end - 1][0] * width) for _, end in _STAGES]
+            self.blocks.append(_Separable(channels, round_channels(out * width), stride, make_norm))
+            channels = round_channels(out * width)
+        self.out_channels = [round_channels(_BLOCKS[end - 1][0] * width) for _, end in _STAGES]
         self.register_buffer("scale", 2 * torch.tensor(STD).view(3, 1, 1), persistent=False)
         self.register_buffer("shift", 2 * torch.tensor(MEAN).view(3, 1, 1) - 1, persistent=False)
-        self.finish(rates, frozen_stages)
+        self.init_stages(rates, frozen_stages)
 
-    def parts(self) -> list[list[nn.Module]]:
-        return [[self.stem_block], *([*self.blocks[start:end]] for start, end in _STAGES)]
+    def stem_modules(self) -> list[nn.Module]:
+        """Return the first convolution with its norm."""
+        return [self.stem_block]
+
+    def stages(self) -> list[list[nn.Module]]:
+        """Return the blocks of each stage."""
+        return [[*self.blocks[start:end]] for start, end in _STAGES]
 
     def stem(self, x: Tensor) -> Tensor:
+        """Compute the input of the first stage."""
         out: Tensor = self.stem_block(x * self.scale + self.shift)
         return out
 
-    def field_of_stem(self) -> tuple[int, int]:
+    def stem_receptive_field(self) -> tuple[int, int]:
+        """Return the side of the stem's receptive field and its stride, px."""
         return 3, 2
 
     def load(self, weights: str) -> None:
-        """Fill a full-width network from a state dict. Raises ValueError as `load_weights`;
-        FileNotFoundError when there is no such file: torchvision publishes none under a name.
+        """Load a state dict into a network of full width; torchvision publishes none by name.
+
+        weights: path of the state dict, whose stem may be called `stem`. Raises ValueError as
+        `load_weights`, and FileNotFoundError when there is no such file.
         """
         state = {
             key.replace("stem.", "stem_block."): value

@@ -3,27 +3,15 @@
 from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
-from cohdc_train.models.backbone import (
-    Norm,
-    Rates,
-    StagedBackbone,
-    load_weights,
-    norm_layer,
-    read_weights,
-)
+from cohdc_train.models.backbone import Backbone, Norm, Rates, norm_layer
+from cohdc_train.models.backbone_weights import load_weights, read_weights
 
-_PARTS = (
-    (0, 2),
-    (2, 4),
-    (4, 7),
-    (7, 14),
-    (14, 18),
-)  # modules of the stem and the stages of strides 4, 8, 16, 32
+_STEM = (0, 2)  # modules of the stem
+_STAGES = ((2, 4), (4, 7), (7, 14), (14, 18))  # and of the stages of strides 4, 8, 16, 32
 
 
-class MobileNetV2(StagedBackbone):
-    """MobileNetV2 without its last convolution; the depthwise ones may follow a dilation pattern
-    inside each stage.
+class MobileNetV2(Backbone):
+    """MobileNetV2 without its last convolution, whose stages may be dilated.
 
     Args:
         width: channels as a share of the network's, rounded to multiples of 8.
@@ -32,7 +20,7 @@ class MobileNetV2(StagedBackbone):
         frozen_stages: how many of the stem and the stages are not trained.
 
     Raises:
-        ValueError: as `StagedBackbone.finish`.
+        ValueError: as `Backbone.init_stages`.
     """
 
     def __init__(
@@ -42,27 +30,35 @@ class MobileNetV2(StagedBackbone):
         norm: Norm = "batch",
         frozen_stages: int = 0,
     ) -> None:
+        """Build the layers."""
         super().__init__()
         whole = mobilenet_v2(width_mult=width, norm_layer=norm_layer(norm))
-        self.features = whole.features[: _PARTS[-1][1]]
-        self.out_channels = [self.features[end - 1].out_channels for _, end in _PARTS[1:]]
-        self.finish(rates, frozen_stages)
+        self.features = whole.features[: _STAGES[-1][1]]
+        self.out_channels = [self.features[end - 1].out_channels for _, end in _STAGES]
+        self.init_stages(rates, frozen_stages)
 
-    def parts(self) -> list[list[nn.Module]]:
-        return [[*self.features[start:end]] for start, end in _PARTS]
+    def stem_modules(self) -> list[nn.Module]:
+        """Return the first convolution and the first block."""
+        return [*self.features[: _STEM[1]]]
+
+    def stages(self) -> list[list[nn.Module]]:
+        """Return the blocks of each stage."""
+        return [[*self.features[start:end]] for start, end in _STAGES]
 
     def stem(self, x: Tensor) -> Tensor:
-        for module in self.parts()[0]:
+        """Compute the input of the first stage."""
+        for module in self.stem_modules():
             x = module(x)
         return x
 
-    def field_of_stem(self) -> tuple[int, int]:
+    def stem_receptive_field(self) -> tuple[int, int]:
+        """Return the side of the stem's receptive field and its stride, px."""
         return 3 + 2 * 2, 2
 
     def load(self, weights: str) -> None:
-        """Fill a full-width network: a torchvision name or the path of a state dict (`classifier.*`
-        is passed over).
+        """Load weights into a network of full width.
 
-        Raises ValueError as `load_weights`, FileNotFoundError as `read_weights`.
+        weights: a torchvision name, or the path of a state dict, whose `classifier.*` is ignored.
+        Raises ValueError as `load_weights`, and FileNotFoundError as `read_weights`.
         """
         load_weights(self, weights, read_weights(weights, "mobilenet_v2"), "MobileNetV2")

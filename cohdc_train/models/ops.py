@@ -1,7 +1,7 @@
-"""Operators that keep the detector exportable: every inner shape but one is known beforehand.
+"""Operators that keep the detector exportable: all inner shapes but one are known in advance.
 
-The one is how many detections there are to segment. Each is an ordinary torch function wrapped as a
-custom operator; `cohdc_train.exporter.export` says what it is in ONNX.
+The exception is the number of detections to segment. Each operator is a torch function wrapped as
+a custom operator; `cohdc_train.exporter.export` says what it is in ONNX.
 """
 
 import torch
@@ -10,15 +10,14 @@ from torch import Tensor
 from torchvision.ops import nms, roi_align
 
 SAMPLING_RATIO = 2
-CANONICAL_SIDE, CANONICAL_LEVEL = (
-    224,
-    4,
-)  # FPN's rule: a 224 px box is pooled from level 4 (stride 16)
+# FPN's rule: a box of 224 px is pooled from level 4 (stride 16).
+CANONICAL_SIDE, CANONICAL_LEVEL = 224, 4
 
 
 def fitted_size(height: int, width: int, canvas: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) in px of an image fitted into the canvas, its aspect kept to the nearest
-    pixel; integers only.
+    """Compute the size of an image fitted into the canvas; its aspect is kept to a pixel.
+
+    Integers only. canvas: (height, width) px. Returns (height, width) px.
     """
     rows, columns = canvas
     if rows * width <= columns * height:
@@ -51,13 +50,13 @@ def _(images: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
 
 @torch.library.custom_op("cohdc::nms_keep", mutates_args=())
 def nms_keep(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float) -> Tensor:
-    """Greedy non-maximum suppression of each image by itself.
+    """Suppress overlapping boxes greedily, each image by itself.
 
-    boxes: float32 [B, n, 4] xyxy; scores: float32 [B, n]. Returns bool [B, n]: kept, and scored
-    above the threshold.
+    boxes: float32 [B, n, 4] xyxy; scores: float32 [B, n]. Returns bool [B, n]: kept, and with a
+    score above the threshold.
     """
     if boxes.is_cuda:  # where every call waits for the device
-        return nms_keep_at_once(boxes, scores, iou_threshold, score_threshold)
+        return nms_keep_batched(boxes, scores, iou_threshold, score_threshold)
     keep = torch.zeros_like(scores, dtype=torch.bool)
     for i in range(boxes.shape[0]):
         candidates = torch.nonzero(scores[i] > score_threshold)[:, 0]
@@ -71,11 +70,12 @@ def _(boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: floa
     return torch.empty_like(scores, dtype=torch.bool)
 
 
-def nms_keep_at_once(
+def nms_keep_batched(
     boxes: Tensor, scores: Tensor, iou_threshold: float, score_threshold: float
 ) -> Tensor:
-    """What `nms_keep` returns, in one suppression of all images, moved apart. No coordinate is
-    below 0.
+    """Suppress overlapping boxes of all images in one call, as `nms_keep` does image by image.
+
+    Images are moved apart for that; no coordinate is below 0.
     """
     keep = torch.zeros_like(scores, dtype=torch.bool)
     candidates = torch.nonzero(scores.flatten() > score_threshold)[:, 0]
@@ -89,11 +89,17 @@ def nms_keep_at_once(
 def roi_pool_levels(
     features: list[Tensor], boxes: Tensor, images: Tensor, strides: list[int], side: int
 ) -> Tensor:
-    """RoIAlign of every box from the pyramid level that suits its size (FPN, eq. 1 of Lin et al.
-    2017).
+    """Pool each box by RoIAlign from the pyramid level of its size (Lin et al. 2017, eq. 1).
 
-    features: [B, C, H / s, W / s] for each stride s; boxes: float32 [R, 4] xyxy, canvas px; images:
-    int64 [R], which image each box is of. Returns [R, C, side, side].
+    Args:
+        features: [B, C, H / s, W / s] for each stride s.
+        boxes: float32 [R, 4] xyxy, canvas px.
+        images: int64 [R], the image that each box belongs to.
+        strides: of the levels.
+        side: cells of the result.
+
+    Returns:
+        [R, C, side, side].
     """
     rois = torch.cat([images[:, None].to(boxes.dtype), boxes], dim=1)
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
@@ -120,8 +126,9 @@ def _(
 
 @torch.library.custom_op("cohdc::rows_to_segment", mutates_args=())
 def rows_to_segment(present: Tensor) -> Tensor:
-    """Which rows of bool [R] are True, as int64 [K] rising. The first is always one of them, so
-    that K is never 0.
+    """Return the indices of the True rows of bool [R], int64 [K] in rising order.
+
+    The first row is always one of them, so that K is never 0.
     """
     wanted = present.clone()
     wanted[0] = True

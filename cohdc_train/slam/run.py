@@ -33,6 +33,7 @@ from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
 from cohdc_train.slam.system import Slam
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
+from cohdc_train.slam.visualization.worst_frames import WorstFrames
 from cohdc_train.trajectory.trajectory import Trajectory
 
 # Options of earlier versions: `cohdc slam` tells their names of today.
@@ -174,6 +175,7 @@ def run_slam(
                 workers = stack.enter_context(parallel)
             slam_system = _build_slam(source.camera, settings, workers)
             files = stack.enter_context(_map_files(source.camera, part, settings, options))
+            worst_frames = WorstFrames()
             viewers = _open_viewer(stack, source.camera, files, options)
             stack.enter_context(stop_on_sigint(source))
             tracked = track_sequence(
@@ -181,10 +183,11 @@ def run_slam(
                 workers.source if workers else source,
                 workers.mask_of if workers else make_masks or no_masks,
                 part / "pictures",
-                [files, *observers, *viewers],
+                [files, worst_frames, *observers, *viewers],
                 workers.report_latency(on_pose) if workers else on_pose,
             )
             files.write(slam_system.map, tracked.trajectory)
+            worst_frames.write(part / "pictures")
         metrics = _metrics(slam_system, tracked, workers, truth, source.num_unpaired)
         inputs = {"sequence": sequence, "model": model, "masks": masks}
         config = _config_text(inputs, source.camera, settings, options)

@@ -1,0 +1,1 @@
+"""Training: `cohdc fit` and the Lightning module around the network."""

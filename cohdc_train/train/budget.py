@@ -1,57 +1,28 @@
-"""How long a training lasts, when it validates, and the trainer that is told so."""
+"""Length of a training, and the interval of its validations."""
 
 import math
 from datetime import timedelta
-from typing import Any, Literal
+from typing import Any
 
-import torch
-from lightning.fabric.plugins.precision.precision import _PRECISION_INPUT
-from lightning.pytorch import Trainer
-
-IMAGES = 6000  # that a training without a budget sees at least
-EPOCHS = (12, 300)  # and fewest and most epochs of it
-VALIDATIONS = (2, 8)  # fewest and most of a training that time ends
-_VALIDATION_MINUTES = 5.0  # between them, within those limits
-_VALIDATIONS = 4  # of a training that steps or epochs end
-
-
-class FitTrainer(Trainer):
-    """Lightning's Trainer with one more precision.
-
-    Args:
-        precision: Lightning's, or "auto": bf16-mixed where GPU or CPU computes in it, 32-true
-            elsewhere.
-    """
-
-    def __init__(
-        self,
-        *args: Any,
-        precision: _PRECISION_INPUT | Literal["auto"] | None = "auto",
-        **kwargs: Any,
-    ) -> None:
-        chosen = (
-            auto_precision(kwargs.get("accelerator", "auto")) if precision == "auto" else precision
-        )
-        super().__init__(*args, precision=chosen, **kwargs)
-
-
-def auto_precision(accelerator: Any = "auto") -> _PRECISION_INPUT:
-    """Return "bf16-mixed" where the device multiplies bfloat16 in hardware, else "32-true"."""
-    if torch.cuda.is_available() and accelerator in ("auto", "gpu", "cuda"):
-        has_bf16 = torch.cuda.is_bf16_supported(including_emulation=False)
-    else:
-        has_bf16 = bool(torch.cpu.get_capabilities().get("avx512_bf16", False))
-    return "bf16-mixed" if has_bf16 else "32-true"
+IMAGES = 6000  # least number of images that a training without a budget sees
+EPOCHS = (12, 300)  # fewest and most epochs of a training without a budget
+VALIDATIONS = (2, 8)  # fewest and most validations of a training that time ends
+_VALIDATION_MINUTES = 5.0  # between the validations of such a training, within those limits
+_VALIDATIONS = 4  # validations of a training that steps or epochs end
 
 
 def training_limits(
     trainer: dict[str, Any], epochs: int | None, minutes: float | None
 ) -> dict[str, Any]:
-    """Return the trainer's limits for `--epochs` and `--minutes`; whichever comes first ends the
-    training.
+    """Return the trainer's limits for `--epochs` and `--minutes`; the first one reached ends it.
 
-    trainer: arguments of the trainer, of which max_epochs, max_steps and max_time are read. Raises
-    ValueError for a budget that is not positive.
+    Args:
+        trainer: arguments of the trainer, of which max_epochs, max_steps and max_time are read.
+        epochs: of `--epochs`.
+        minutes: of `--minutes`.
+
+    Raises:
+        ValueError: the budget is not positive.
     """
     if epochs is not None and epochs < 1:
         raise ValueError(f"--epochs {epochs}: at least 1")
@@ -76,13 +47,13 @@ def is_bounded(limits: dict[str, Any]) -> bool:
 
 
 def default_epochs(num_images: int) -> int:
-    """Return the epochs of a training without a budget: enough to see IMAGES images, within EPOCHS."""
+    """Return the epochs of a training without a budget: to see IMAGES images, within EPOCHS."""
     fewest, most = EPOCHS
     return min(most, max(fewest, math.ceil(IMAGES / max(1, num_images))))
 
 
 def validation_interval(limits: dict[str, Any]) -> dict[str, Any]:
-    """Return the trainer's arguments that spread a few validations over a training of these limits."""
+    """Return the trainer's arguments that spread a few validations over a training."""
     if limits["max_time"] is not None:
         whole = _as_timedelta(limits["max_time"])
         fewest, most = VALIDATIONS
@@ -95,12 +66,13 @@ def validation_interval(limits: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_timedelta(value: Any) -> timedelta:
-    """Return a duration from Lightning's forms: timedelta, "DD:HH:MM:SS", or a dict of its fields."""
+    """Convert Lightning's forms of a duration: timedelta, "DD:HH:MM:SS", dict of its fields."""
     if isinstance(value, str):
         parts = value.split(":")
         if len(parts) != 4 or not all(part.isdigit() for part in parts):
             raise ValueError(
-                f"--trainer.max_time {value}: give DD:HH:MM:SS, such as 00:00:10:00, or --minutes 10"
+                f"--trainer.max_time {value}: give DD:HH:MM:SS, such as 00:00:10:00, "
+                "or --minutes 10"
             )
         days, hours, minutes, seconds = (int(part) for part in parts)
         return timedelta(days=days, hours=hours, minutes=minutes, seconds=seconds)

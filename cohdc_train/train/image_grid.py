@@ -1,4 +1,4 @@
-"""Validation images beside each other: truth, prediction, and a list of what was found (OpenCV)."""
+"""Grid of validation images: truth, prediction, and a list of the detections (OpenCV)."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ _MISTAKE: Color = (255, 60, 60)
 _WRONG_CLASS: Color = (255, 150, 0)
 _CROWD: Color = (255, 255, 255)
 _INK: Color = (230, 230, 230)
-_PAPER = 28  # grey value of the background
+_PAPER = 28  # gray level of the background
 
 
 def draw_tiles(
@@ -42,30 +42,42 @@ def draw_tiles(
     names: Sequence[str],
     columns: int = 2,
 ) -> bytes:
-    """A JPEG of images, each with its truth on the left, its prediction in the middle and a list on
-    the right.
+    """Draw a grid of images: truth on the left, prediction in the middle, a list on the right.
 
-    An object and the detection that found it share number and color; red: missed or false, orange:
-    found as another
-    class, white: crowd. images: by id. Raises DataError naming an image that cannot be read.
+    An object and the detection that matches it share number and color; red: missed or false,
+    orange: detected as another class, white: crowd.
+
+    Args:
+        title: first line of the grid.
+        matches: objects and detections of the images.
+        images: by id.
+        names: of the classes.
+        columns: images in a row.
+
+    Returns:
+        JPEG.
+
+    Raises:
+        DataError: an image cannot be read; the message names it.
     """
     tiles = [_tile(match, images[match.image_id], names) for match in matches]
     blank = _paper(_LINE + _PANEL[0] + _GAP, 2 * _PANEL[1] + _LIST + 3 * _GAP)
     tiles += [blank] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
-    legend = "left: truth, middle: predicted at class score >= 0.5; same number: found; red: missed or false"
+    legend = (
+        "left: truth, middle: predicted at class score >= 0.5; same number: found; "
+        "red: missed or false; orange: other class; white: crowd; q: predicted quality"
+    )
     head = _paper(3 * _LINE, columns * blank.shape[1])
-    for line, text in enumerate(
-        (title, legend + "; orange: other class; white: crowd; q: predicted quality")
-    ):
+    for line, text in enumerate((title, legend)):
         _write(head, text, (_GAP, (line + 1) * _LINE + 2), _INK, 0.5)
-    picture = np.vstack([head, *rows])
-    return encode_jpeg(picture)
+    return encode_jpeg(np.vstack([head, *rows]))
 
 
 class _Entry(NamedTuple):
-    """A line of the list, and what carries its number. Misses have none: they share a line per
-    class.
+    """Line of the list, and the object and detection that carry its number.
+
+    Misses have no number: they share a line per class.
     """
 
     text: str
@@ -84,7 +96,7 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
         _tint(truth, _mask(missed, truth), _MISTAKE)
     _draw(truth, [(entry.object, entry.color) for entry in entries])
     _draw(predicted, [(entry.detection, entry.color) for entry in entries])
-    right = int(match.right.sum())
+    right = int(match.is_correct.sum())
     counts = f"objects {len(match.objects)}, found {right}, false {len(match.detections) - right}"
     head = _paper(_LINE, 2 * _PANEL[1] + _LIST + 3 * _GAP)
     _write(
@@ -96,13 +108,13 @@ def _tile(match: ImageMatch, image: CocoImage, names: Sequence[str]) -> Image:
     )
     gap = _paper(_PANEL[0], _GAP)
     body = np.hstack(
-        [gap, _centred(truth), gap, _centred(predicted), gap, _list(match, entries, names)]
+        [gap, _centered(truth), gap, _centered(predicted), gap, _list(match, entries, names)]
     )
     return np.vstack([head, body, _paper(_GAP, body.shape[1])])
 
 
 def _draw(shown: Image, rows: Sequence[tuple[Row | None, Color]]) -> None:
-    """Masks, then on top of them their numbers, where there is room; they count the entries from 1."""
+    """Draw masks, then on top of them their numbers where there is room; numbers count from 1."""
     masks = [None if row is None else _mask(row, shown) for row, _ in rows]
     for mask, (_, color) in zip(masks, rows, strict=True):
         if mask is not None:
@@ -122,16 +134,16 @@ def _tint(shown: Image, mask: Mask, color: Color) -> None:
 
 
 def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
-    """What was found, then false detections."""
+    """List matched detections, then false ones."""
     found: list[_Entry] = []
     for j, (i, o) in enumerate(match.pairs()):
         if i < 0:
             continue
         name = names[o["category_id"] - 1]
         detection = match.detections[i]
-        color = _COLORS[len(found) % len(_COLORS)] if match.right[j] else _WRONG_CLASS
+        color = _COLORS[len(found) % len(_COLORS)] if match.is_correct[j] else _WRONG_CLASS
         seen = names[detection["category_id"] - 1]
-        what = seen if match.right[j] else f"{seen}, is {name}"
+        what = seen if match.is_correct[j] else f"{seen}, is {name}"
         found.append(
             _Entry(
                 f"{what} {_values(detection)} IoU {match.overlaps[i, j]:.2f}", color, o, detection
@@ -139,7 +151,7 @@ def _entries(match: ImageMatch, names: Sequence[str]) -> list[_Entry]:
         )
     false: list[_Entry] = []
     for i, row in enumerate(match.detections):
-        if i not in match.found:
+        if i not in match.detection_of:
             overlap = match.overlaps[i].max(initial=0.0)
             text = f"{names[row['category_id'] - 1]} {_values(row)} IoU {overlap:.2f} false"
             false.append(_Entry(text, _MISTAKE, None, row))
@@ -173,8 +185,10 @@ def _mask(row: Row, shown: Image) -> Mask:
 
 
 def _free_place(mask: Mask, taken: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
-    """(x, y) of a number's lower left corner: where the mask is widest, or just below or above when
-    a number stands there; None when there too."""
+    """Return (x, y) of a number's lower left corner; None where there is no room.
+
+    The place is where the mask is widest, or just below or above when a number stands there.
+    """
     depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     width, height = _NUMBER
@@ -186,7 +200,7 @@ def _free_place(mask: Mask, taken: Sequence[tuple[int, int]]) -> tuple[int, int]
     return None
 
 
-def _centred(shown: Image) -> Image:
+def _centered(shown: Image) -> Image:
     panel = _paper(*_PANEL)
     top, left = ((panel.shape[k] - shown.shape[k]) // 2 for k in (0, 1))
     panel[top : top + shown.shape[0], left : left + shown.shape[1]] = shown
@@ -198,6 +212,6 @@ def _paper(height: int, width: int) -> Image:
 
 
 def _write(shown: Image, text: Any, place: tuple[int, int], ink: Color, scale: float) -> None:
-    """OpenCV has letters for ASCII only; others become question marks."""
+    """Write text; OpenCV has letters for ASCII only, others become question marks."""
     plain = str(text).encode("ascii", "replace").decode()
     cv2.putText(shown, plain, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, 1, cv2.LINE_AA)

@@ -36,7 +36,7 @@ Network = Mapping[str, Any]  # the fields of NetworkConfig by name
 
 @dataclass(frozen=True)
 class InitialWeights:
-    """Where a training's first weights come from.
+    """Source of a training's first weights.
 
     Attributes:
         kind: "network" is a checkpoint or exported file with weights of all layers, "backbone" a
@@ -84,7 +84,8 @@ def choose_initial_weights(
         stored = _read_weights(resumed)
         if "hyper_parameters" not in stored or "loops" not in stored:
             raise CohdcError(
-                f"{resumed}: not a checkpoint of cohdc fit; --pretrained takes weights of other kinds"
+                f"{resumed}: not a checkpoint of cohdc fit; "
+                "--pretrained takes weights of other kinds"
             )
         return InitialWeights("resumed", str(resumed), stored=stored["hyper_parameters"])
     if pretrained == "none":
@@ -92,7 +93,7 @@ def choose_initial_weights(
     if pretrained == "imagenet":
         return _published(network)
     if pretrained != "auto":
-        return _of_file(pretrained)
+        return _from_file(pretrained)
     if network["weights"] is not None:
         return InitialWeights("backbone", str(network["weights"]))
     if _has_layers_of_shipped(network):
@@ -110,10 +111,10 @@ def choose_initial_weights(
 
 
 def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]:
-    """Return the fields of the network that follow from its initial weights: weights, norm and
-    frozen_stages.
+    """Return the network's weights, norm and frozen_stages that follow from its initial weights.
 
-    Raises CohdcError where a given norm cannot hold them.
+    Raises:
+        CohdcError: a norm that the user has given cannot hold the weights.
     """
     if initial.kind == "resumed":
         stored = initial.stored.get("network", {})
@@ -127,8 +128,8 @@ def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]
     is_exported = initial.kind == "network" and model_path(initial.source).suffix == ".onnx"
     if is_exported and network["norm"] == "batch":
         raise CohdcError(
-            f"{initial.source}: an exported file holds no norms to train; give --model.network.norm frozen, or start "
-            "from other weights with --pretrained"
+            f"{initial.source}: an exported file holds no norms to train; give "
+            "--model.network.norm frozen, or start from other weights with --pretrained"
         )
     frozen_stages = network["frozen_stages"]
     if frozen_stages is None:
@@ -141,9 +142,7 @@ def resolve_network(initial: InitialWeights, network: Network) -> dict[str, Any]
 
 
 def resolve_backbone_lr(initial: InitialWeights, backbone_lr: float | None) -> float:
-    """Return the learning rate of the backbone, as a share of the rest's, that the initial weights
-    ask for.
-    """
+    """Return the backbone's learning rate, as a share of lr, that the initial weights ask for."""
     if backbone_lr is None and initial.kind == "resumed":
         backbone_lr = initial.stored.get("optimizer", {}).get("backbone_lr")
     config = OptimizerConfig(backbone_lr=backbone_lr).resolved(pretrained=initial.kind != "random")
@@ -151,20 +150,23 @@ def resolve_backbone_lr(initial: InitialWeights, backbone_lr: float | None) -> f
 
 
 def _published(network: Network) -> InitialWeights:
+    """Return torchvision's weights of the backbone."""
     if network["backbone"] == "mobilenet_v1":
         raise CohdcError(
-            "torchvision publishes no weights for mobilenet_v1; give a local file with --pretrained FILE.pth, or start "
-            "from random weights with --pretrained none"
+            "torchvision publishes no weights for mobilenet_v1; give a local file with "
+            "--pretrained FILE.pth, or start from random weights with --pretrained none"
         )
     return InitialWeights("backbone", _PUBLISHED)
 
 
-def _of_file(pretrained: str) -> InitialWeights:
+def _from_file(pretrained: str) -> InitialWeights:
+    """Return the weights of a file or a shipped network."""
     path = model_path(pretrained)
     if not path.is_file():
         names = ", ".join(shipped_models())
         raise CohdcError(
-            f"{pretrained}: no such file; give auto, none, imagenet, a shipped network ({names}) or a file"
+            f"{pretrained}: no such file; give auto, none, imagenet, a shipped network ({names}) "
+            "or a file"
         )
     if path.suffix == ".onnx":
         return InitialWeights("network", pretrained)
@@ -176,8 +178,10 @@ def _of_file(pretrained: str) -> InitialWeights:
 
 
 def _read_weights(path: Path) -> dict[str, Any]:
-    """Read what `torch.save` wrote. Raises CohdcError naming the file when it is neither weights
-    nor a checkpoint.
+    """Read what `torch.save` wrote.
+
+    Raises:
+        CohdcError: the file holds neither weights nor a checkpoint.
     """
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
@@ -193,9 +197,7 @@ def _read_weights(path: Path) -> dict[str, Any]:
 
 
 def _has_layers_of_shipped(network: Network) -> bool:
-    """Return whether the shipped network's weights fit: the same layers of the same shapes, but for
-    the classes.
-    """
+    """Return whether the shipped weights fit: layers of equal shapes, except for the classes."""
     fields = yaml.safe_load(config_path(_SHIPPED_CONFIG).read_text(encoding="utf-8"))["model"][
         "network"
     ]

@@ -1,6 +1,4 @@
-"""The C library's memory, kept for the next step of a network instead of being given back after
-every operator.
-"""
+"""Memory of the C library, kept for the next step instead of returned after each operator."""
 
 import ctypes
 import platform
@@ -11,11 +9,11 @@ _KEPT = 1 << 30  # bytes free at the heap's end, up to which they stay
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep freed blocks of up to 32 MiB; no other C library is touched.
+    """Make glibc keep freed blocks of up to 32 MiB; no other C library is touched.
 
-    Otherwise every feature map of some MiB is mapped anew, and the kernel clears its pages one by
+    Otherwise each feature map of some MiB is mapped again, and the kernel clears its pages one by
     one, which costs up to a third of a cheap convolution's time. Peak memory stays about what it
-    was; what is freed stays this process's.
+    was; freed memory stays with this process.
     """
     if platform.libc_ver()[0] == "glibc":
         c_library = ctypes.CDLL(None)

@@ -1,6 +1,4 @@
-"""The weights of an exported file, back in a network: what a training can start from when no
-checkpoint is left.
-"""
+"""Weights of an exported file, loaded into a network: a start where no checkpoint is left."""
 
 import json
 import re
@@ -12,8 +10,8 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from onnx import ModelProto, NodeProto, numpy_helper
 from torch import Tensor, nn
 
-from cohdc_train.models import MaskRCNN, detect, fused
-from cohdc_train.models.frozen_norm import FrozenNorm, conv_norm_pairs
+from cohdc_train.models import MaskRCNN, detect, fuse_conv_bn
+from cohdc_train.models.frozen_norm import FrozenNorm, conv_bn_pairs
 from cohdc_train.signature import KEY_CLASSES
 
 _LAYERS = nn.Conv2d | nn.ConvTranspose2d | nn.Linear
@@ -21,9 +19,12 @@ _NAMED, _NUMBER = re.compile(r"network\.(.+)\.weight"), re.compile(r"\d+")
 _OPERATORS = ("Conv", "ConvTranspose", "Gemm")
 
 
-def read_exported(path: Path) -> tuple[ModelProto, list[str]]:
-    """An ONNX file that `cohdc export` wrote, and its classes. Raises ValueError when it is none,
-    OSError unread.
+def read_onnx_weights(path: Path) -> tuple[ModelProto, list[str]]:
+    """Read an ONNX file that `cohdc export` wrote, and its class names.
+
+    Raises:
+        ValueError: it is no such file.
+        OSError: it cannot be read.
     """
     try:
         model = onnx.load(path)
@@ -35,21 +36,23 @@ def read_exported(path: Path) -> tuple[ModelProto, list[str]]:
     return model, list(json.loads(classes))
 
 
-def load_exported(network: MaskRCNN, model: ModelProto) -> None:
-    """Put the weights of an exported file, quantised or not, into a network of the same shape.
+def load_onnx_weights(network: MaskRCNN, model: ModelProto) -> None:
+    """Load the weights of an exported file, quantized or not, into a network of the same shape.
 
     A layer into which its norm was folded has lost its name; such layers are paired in the order in
     which they run. Norms must be frozen here; they become the identity and a shift.
-    Raises ValueError when the layers do not agree, or a norm is one that is trained.
+
+    Raises:
+        ValueError: the layers do not agree, or a norm is one that is trained.
     """
-    stored = _stored(model)
-    layers = _running(network)
+    stored = _read_layers(model)
+    layers = _layers_in_order(network)
     numbered = iter(sorted(key for key in stored if isinstance(key, int)))
     if len(layers) != len(stored):
         raise ValueError(f"the file has {len(stored)} layers, the network {len(layers)}")
     norms = {
         getattr(module, name): getattr(module, norm)
-        for module, name, norm in conv_norm_pairs(network)
+        for module, name, norm in conv_bn_pairs(network)
     }
     own = dict(network.named_modules())
     for name in layers:
@@ -61,7 +64,8 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
         norm = norms.get(layer)
         if layer.weight.shape != weights.shape:
             raise ValueError(
-                f"layer {name} is {list(weights.shape)} in the file, {list(layer.weight.shape)} here"
+                f"layer {name} is {list(weights.shape)} in the file, "
+                f"{list(layer.weight.shape)} here"
             )
         with torch.no_grad():
             layer.weight.copy_(weights)
@@ -78,12 +82,13 @@ def load_exported(network: MaskRCNN, model: ModelProto) -> None:
             norm.bias.copy_(bias)
 
 
-def _running(network: MaskRCNN) -> list[str]:
-    """Names of the layers in the order in which they first run, the mask and CQE heads' without a
-    detection too.
+def _layers_in_order(network: MaskRCNN) -> list[str]:
+    """Return the names of the layers in the order in which they first run.
+
+    The mask and CQE heads run without a detection too.
     """
     names: list[str] = []
-    copy = fused(network)
+    copy = fuse_conv_bn(network)
     for name, module in copy.named_modules():
         if isinstance(module, _LAYERS):
             module.register_forward_pre_hook(lambda _, __, name=name: names.append(name))
@@ -91,22 +96,21 @@ def _running(network: MaskRCNN) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _stored(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:
-    """Weights and bias of every layer, by its name, or by the number that the exporter gave it in
-    its order.
-    """
+def _read_layers(model: ModelProto) -> dict[str | int, tuple[Tensor, Tensor]]:
+    """Return weights and bias of each layer by its name, or by the exporter's number for it."""
     tensors = {one.name: one for one in model.graph.initializer}
     makers = {name: node for node in model.graph.node for name in node.output}
     found: dict[str | int, tuple[Tensor, Tensor]] = {}
     for node in model.graph.node:
         if node.op_type in _OPERATORS:
             weights, *biases = (_value(name, tensors, makers) for name in node.input[1:3])
-            bias = biases[0] if biases else torch.zeros(())  # one that was all zeros is left out
+            bias = biases[0] if biases else torch.zeros(())  # the export drops a bias of zeros
             found[_key(node.input[1])] = weights, bias
     return found
 
 
 def _key(weights: str) -> str | int:
+    """Return the name of a layer, or its number, from the name of its weights."""
     if named := _NAMED.match(weights):
         return named[1]
     if number := _NUMBER.search(weights):
@@ -115,16 +119,16 @@ def _key(weights: str) -> str | int:
 
 
 def _value(name: str, tensors: dict[str, onnx.TensorProto], makers: dict[str, NodeProto]) -> Tensor:
-    """An initialiser, or what DequantizeLinear makes of one."""
+    """Return an initializer, or what DequantizeLinear makes of one."""
     if name in tensors:
         return torch.from_numpy(numpy_helper.to_array(tensors[name]).copy())
     node = makers[name]
     if node.op_type != "DequantizeLinear":
         raise ValueError(f"{name} is made by {node.op_type}")
-    quantised, scale, *zero = (_value(one, tensors, makers) for one in node.input)
+    quantized, scale, *zero = (_value(one, tensors, makers) for one in node.input)
     axis = next((a.i for a in node.attribute if a.name == "axis"), 1)
-    shape = [1] * quantised.ndim
+    shape = [1] * quantized.ndim
     if scale.numel() > 1:
         shape[axis] = -1
     shift = zero[0].float().reshape(shape) if zero else 0.0
-    return (quantised.float() - shift) * scale.reshape(shape)
+    return (quantized.float() - shift) * scale.reshape(shape)

@@ -1,4 +1,4 @@
-"""The folder that `cohdc fit` writes into: files there that no former training wrote are kept."""
+"""The output folder of `cohdc fit`: files that no former training wrote are kept."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,16 +7,18 @@ from typing import Any
 from lightning.pytorch.utilities import rank_zero_only
 
 from cohdc_train.files import check_folder, claim_folder
+from cohdc_train.train.checkpoints import BEST, LAST
 
 _VERB = "fit"
 
 
 @rank_zero_only
 def check_out(config: Mapping[str, Any]) -> None:
-    """Raise DataError when a training would write over files that no former training wrote.
+    """Raise DataError when a training would replace files that no former training wrote.
 
-    config: resolved options of `cohdc fit`. Only the first process looks: the others start when it
-    may have written already.
+    Only the first process looks: the others start when it may have written already.
+
+    config: resolved options of `cohdc fit`.
     """
     check_folder(Path(config["out"]), _VERB, _names(config))
 
@@ -29,6 +31,5 @@ def claim_out(config: Mapping[str, Any]) -> None:
 
 def _names(config: Mapping[str, Any]) -> list[str]:
     """Return the names that a training replaces; logs/ gets a new version_N each time."""
-    best = f"{config['checkpoint']['filename']}.ckpt"
-    names = ["config.yaml", best, "last.ckpt", "lr_find.png"]
-    return [*names, "pictures"] if config["pictures"] else names
+    names = ["config.yaml", BEST, LAST, "lr_find.png"]
+    return [*names, "figures"] if config["figures"] else names

@@ -1,6 +1,4 @@
-"""Checks of minutes before a training of hours: a learning-rate range test, and a few images
-learned by heart.
-"""
+"""Checks of minutes before a training of hours: a learning-rate range test, and overfitting."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,13 +8,14 @@ import numpy as np
 from lightning.pytorch.tuner.tuning import Tuner
 
 from cohdc_train.files import write_bytes
-from cohdc_train.train.validation_plots import plot_lr_find
+from cohdc_train.train.messages import say
+from cohdc_train.train.training_plots import plot_lr_find
 
+LEARNED_AP50 = 0.5
 _STEPS = 100
 _RANGE = (1e-6, 3e-2)  # beyond it AdamW diverges
 _BEGINNING = 10  # steps
 _CLEAR_FALL = 0.9  # of the loss at the beginning
-LEARNED_AP50 = 0.5
 
 
 def find_learning_rate(
@@ -38,15 +37,17 @@ def find_learning_rate(
     rates, losses = ([], []) if finder is None else (finder.results["lr"], finder.results["loss"])
     suggestion = suggest_rate(rates, losses)
     if suggestion is None:
-        print(
-            "lr find: the loss hardly falls at any rate; keep the default, or check the labels with --overfit 8"
+        say(
+            "lr find: the loss hardly falls at any rate; keep the default, or check the labels "
+            "with --overfit 8"
         )
         return
     out.mkdir(parents=True, exist_ok=True)
     plot = out / "lr_find.png"
     write_bytes(plot, plot_lr_find(rates, losses, suggestion))
-    print(
-        f"lr find: --model.optimizer.lr {suggestion:.1e}, a tenth of the rate of the lowest loss ({plot})"
+    say(
+        f"lr find: --model.optimizer.lr {suggestion:.1e}, a tenth of the rate of the lowest loss "
+        f"({plot})"
     )
 
 
@@ -63,14 +64,15 @@ def suggest_rate(rates: Sequence[float], losses: Sequence[float]) -> float | Non
 
 
 def overfit_verdict(scores: Mapping[str, float], num_images: int) -> str:
-    """Return one line: whether the network learned its few images by heart.
+    """Return one line: whether the network has learned the images that it was trained on.
 
     scores: of the validation on the training images.
     """
     ap50 = scores["segm_AP50"]
+    trained = f"overfit: AP50 {ap50:.2f} on its own {num_images} images"
     if ap50 >= LEARNED_AP50:
-        return f"overfit: AP50 {ap50:.2f} on its own {num_images} images: labels and network agree"
+        return f"{trained}: labels and network agree"
     return (
-        f"overfit: AP50 {ap50:.2f} on its own {num_images} images, {LEARNED_AP50} is normal: look at the labels "
-        "(cohdc data doctor), at pictures/worst.jpg, or train longer (--trainer.max_steps)"
+        f"{trained}, {LEARNED_AP50} is normal: look at the labels (cohdc data doctor), at "
+        "figures/worst.jpg, or train longer (--trainer.max_steps)"
     )

@@ -1,6 +1,4 @@
-"""What the end of a training says: scores, files, the next command, and hints where something is
-off.
-"""
+"""Closing lines of a training: scores, hints where something is off, files, the next command."""
 
 import math
 from collections import Counter
@@ -13,6 +11,7 @@ import numpy as np
 from cohdc_train.data.annotations import CocoImage
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.models import NetworkConfig
+from cohdc_train.train.checkpoints import BEST, LAST
 from cohdc_train.train.initial_weights import FEW_IMAGES
 from cohdc_train.train.module import MaskRCNNModule
 from cohdc_train.train.progress import ProgressReporter
@@ -20,17 +19,19 @@ from cohdc_train.train.progress import ProgressReporter
 LOW_AP50 = 0.05
 MANY_SMALL = 0.3  # share of objects below the anchors from which the canvas is too small
 _SMALL_BATCH = 8  # images below which BatchNorm's statistics are noise
-_FILES = ("best.ckpt", "last.ckpt", "config.yaml", "pictures", "logs")
-_PART = 5  # the first and the last fifth of the losses are compared
+_FILES = (BEST, LAST, "config.yaml", "figures", "logs")
+_PARTS = 5  # the first and the last fifth of the losses are compared
+_MIN_PART = 10  # steps of a fifth from which they are
+_CLEAR_FALL = 0.98  # of the loss in the first fifth
 
 
 @dataclass(frozen=True)
 class TrainingFacts:
-    """What the hints are drawn from.
+    """Facts of a finished training that its closing lines tell.
 
     Attributes:
-        scores: of the last validation, by name.
-        class_counts: class name -> validation objects.
+        scores: of the best validation, by name; empty without one.
+        class_counts: validation objects by class name.
         losses: total loss of every step.
         network: of the training.
         batch_size: images per batch and device.
@@ -49,34 +50,20 @@ class TrainingFacts:
     canvas: tuple[int, int]
 
     def small_ratio(self) -> float:
-        """Return the share of training objects that are smaller on the canvas than half the
-        smallest anchor.
-        """
+        """Return the share of training objects below half the smallest anchor on the canvas."""
         limit = min(self.network.anchor_scales) / 2
         sides = [side for image in self.images for side in _sides_on_canvas(image, self.canvas)]
         return sum(side < limit for side in sides) / max(1, len(sides))
 
 
-def hints(facts: TrainingFacts) -> list[str]:
-    """Return a sentence for each thing that is off, with what to do; none for a healthy training."""
-    found = [
-        _low_score_hint(facts),
-        _loss_hint(facts.losses),
-        _class_hint(facts),
-        _anchor_hint(facts),
-        _norm_hint(facts),
-    ]
-    return [hint for hint in found if hint]
-
-
 def training_facts(
     module: MaskRCNNModule, data: CocoDataModule, reporter: ProgressReporter, random_weights: bool
 ) -> TrainingFacts:
-    """Collect what the summary and its hints say of a finished training; its best validation is
-    scored.
-    """
+    """Collect the facts of a finished training; the scores are of its best validation."""
     best = max(
-        reporter.history, key=lambda scores: (not math.isnan(scores["segm_AP"]), scores["segm_AP"])
+        reporter.history,
+        key=lambda scores: (not math.isnan(scores["segm_AP"]), scores["segm_AP"]),
+        default={},
     )
     counts = Counter(
         o.label for image in data.folder.val.images for o in image.objects if not o.crowd
@@ -94,34 +81,50 @@ def training_facts(
     )
 
 
-def summary_lines(facts: TrainingFacts, out: Path, best_ap: float | None = None) -> list[str]:
+def summary_lines(
+    facts: TrainingFacts, out: Path, timing: str = "", best_ap: float | None = None
+) -> list[str]:
     """Return the last lines of a training.
 
-    out: its folder; best_ap: mask AP of best.ckpt, which may be of an earlier session.
+    Args:
+        facts: of the training.
+        out: its folder.
+        timing: a line on times.
+        best_ap: mask AP of best.ckpt, which may be of an earlier session.
     """
-    scores = facts.scores
-    lines = [
-        f"best.ckpt: mask AP {scores['segm_AP']:.3f}, AP50 {scores['segm_AP50']:.3f} on the validation split"
-    ]
-    per_class = [
-        f"{name} {scores[f'segm_AP/{name}']:.3f}"
-        for name in facts.class_counts
-        if f"segm_AP/{name}" in scores
-    ]
-    if per_class:
-        lines.append(f"mask AP per class: {', '.join(per_class)}")
+    lines = _score_lines(facts, best_ap) if facts.scores else []
     lines += [f"hint: {hint}" for hint in hints(facts)]
-    if best_ap is not None and best_ap > scores["segm_AP"] + 1e-6:
-        lines[0] = (
-            f"best.ckpt: mask AP {best_ap:.3f}, of an earlier session; this one reached {scores['segm_AP']:.3f}"
-        )
+    if timing:
+        lines.append(timing)
     files = [name for name in _FILES if (out / name).exists()]
     if files:
         lines.append(f"files in {out}: {', '.join(files)}")
-    if "best.ckpt" in files:
-        lines.append(
-            f"next: cohdc export {out / 'best.ckpt'} --images {facts.images[0].path.parent}"
-        )
+    if BEST in files:
+        images = facts.images[0].path.parent
+        lines.append(f"next: cohdc export {out / BEST} --images {images}")
+    return lines
+
+
+def hints(facts: TrainingFacts) -> list[str]:
+    """Return a sentence for each thing that is off, with what to do; none for a good training."""
+    score_hints = [_low_score_hint(facts), _class_hint(facts)] if facts.scores else []
+    other_hints = [_loss_hint(facts.losses), _anchor_hint(facts), _norm_hint(facts)]
+    return [hint for hint in (*score_hints, *other_hints) if hint]
+
+
+def _score_lines(facts: TrainingFacts, best_ap: float | None) -> list[str]:
+    """Return a line on best.ckpt, and one on the classes where there are several."""
+    ap, ap50 = facts.scores["segm_AP"], facts.scores["segm_AP50"]
+    lines = [f"{BEST}: mask AP {ap:.3f}, AP50 {ap50:.3f} on the validation split"]
+    if best_ap is not None and best_ap > ap + 1e-6:
+        lines = [f"{BEST}: mask AP {best_ap:.3f}, of an earlier session; this one reached {ap:.3f}"]
+    per_class = [
+        f"{name} {facts.scores[f'segm_AP/{name}']:.3f}"
+        for name in facts.class_counts
+        if f"segm_AP/{name}" in facts.scores
+    ]
+    if per_class:
+        lines.append(f"mask AP per class: {', '.join(per_class)}")
     return lines
 
 
@@ -135,27 +138,15 @@ def _low_score_hint(facts: TrainingFacts) -> str:
     ap50 = facts.scores["segm_AP50"]
     if not ap50 < LOW_AP50:
         return ""
+    steps = f"AP50 is {ap50:.3f} after {len(facts.losses)} steps"
     if facts.random_weights and len(facts.images) < FEW_IMAGES:
         return (
-            f"AP50 is {ap50:.3f} after {len(facts.losses)} steps from random weights on {len(facts.images)} images: "
+            f"{steps} from random weights on {len(facts.images)} images: "
             "start from trained ones (--pretrained auto)"
         )
     return (
-        f"AP50 is {ap50:.3f} after {len(facts.losses)} steps: train longer (--minutes, --epochs), look at "
-        "pictures/worst.jpg, and check the labels with cohdc data doctor and cohdc fit --overfit 8"
-    )
-
-
-def _loss_hint(losses: Sequence[float]) -> str:
-    part = len(losses) // _PART
-    if part < 10:
-        return ""
-    first, last = float(np.mean(losses[:part])), float(np.mean(losses[-part:]))
-    if last < 0.98 * first:
-        return ""
-    return (
-        f"the loss did not fall: {first:.3f} in the first fifth of the steps, {last:.3f} in the last: try another rate "
-        "(cohdc fit --lr_find true, --model.optimizer.lr)"
+        f"{steps}: train longer (--minutes, --epochs), look at figures/worst.jpg, and check the "
+        "labels with cohdc data doctor and cohdc fit --overfit 8"
     )
 
 
@@ -170,13 +161,26 @@ def _class_hint(facts: TrainingFacts) -> str:
     return f"never detected: {', '.join(missed)}; they need more training images" if missed else ""
 
 
+def _loss_hint(losses: Sequence[float]) -> str:
+    part = len(losses) // _PARTS
+    if part < _MIN_PART:
+        return ""
+    first, last = float(np.mean(losses[:part])), float(np.mean(losses[-part:]))
+    if last < _CLEAR_FALL * first:
+        return ""
+    return (
+        f"the loss did not fall: {first:.3f} in the first fifth of the steps, {last:.3f} in the "
+        "last: try another rate (cohdc fit --lr_find true, --model.optimizer.lr)"
+    )
+
+
 def _anchor_hint(facts: TrainingFacts) -> str:
     ratio = facts.small_ratio()
     if ratio < MANY_SMALL:
         return ""
-    smallest = min(facts.network.anchor_scales)
+    limit = min(facts.network.anchor_scales) // 2
     return (
-        f"{ratio:.0%} of the objects are smaller than {smallest // 2} px on the canvas, half the smallest "
+        f"{ratio:.0%} of the objects are smaller than {limit} px on the canvas, half the smallest "
         "anchor: a larger --data.canvas sees them"
     )
 
@@ -185,6 +189,7 @@ def _norm_hint(facts: TrainingFacts) -> str:
     if facts.network.norm != "batch" or facts.batch_size >= _SMALL_BATCH:
         return ""
     return (
-        f"BatchNorm was trained on batches of {facts.batch_size}, and its statistics are noise below {_SMALL_BATCH} "
-        "images: raise --data.batch_size, or start from trained weights with frozen norms (--pretrained auto)"
+        f"BatchNorm was trained on batches of {facts.batch_size}, and its statistics are noise "
+        f"below {_SMALL_BATCH} images: raise --data.batch_size, or start from trained weights with "
+        "frozen norms (--pretrained auto)"
     )

@@ -1,6 +1,4 @@
-"""Pictures of a validation: image grids, precision-recall, calibration, confusion; and of a
-training's log.
-"""
+"""Figures of a validation: image grids, precision-recall, calibration, confusion, losses."""
 
 import traceback
 from collections.abc import Callable, Iterable, Mapping
@@ -14,40 +12,46 @@ from lightning.pytorch.utilities import rank_zero_warn
 from cohdc_train.data.annotations import CocoImage
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes
-from cohdc_train.metrics.coco_metrics import Results, category_names
-from cohdc_train.metrics.matching import confusion_matrix, match_images, ranked
+from cohdc_train.metrics.average_precision import category_names
+from cohdc_train.metrics.coco_metrics import Results
+from cohdc_train.metrics.matching import best_and_worst, confusion_matrix, match_images
 from cohdc_train.train.image_grid import draw_tiles
 from cohdc_train.train.module import MaskRCNNModule
+from cohdc_train.train.training_plots import plot_log
 from cohdc_train.train.validation_plots import (
     class_names,
     plot_calibration,
     plot_confusion,
-    plot_log,
     plot_precision_recall,
 )
 
 VALIDATION_FILES = ("best.jpg", "worst.jpg", "pr_curves.png", "calibration.png", "confusion.png")
-_IMAGES = 6  # in a grid
+_NUM_IMAGES = 6  # in a grid
 _SCORE = "score = sum of mask IoU of the objects found / (objects + false detections)"
 
 
 def draw_validation(results: Results, images: Iterable[CocoImage]) -> dict[str, bytes]:
-    """File name -> content of a validation's pictures.
+    """Draw the figures of a validation.
 
-    best.jpg, worst.jpg: the images predicted best and worst, by `ImageMatch.score`; pr_curves.png,
-    calibration.png, confusion.png. images: of the validation split. Raises DataError naming an
-    image that cannot be read.
+    Args:
+        results: of the validation.
+        images: of the validation split.
+
+    Returns:
+        Content by file name: best.jpg and worst.jpg with the images predicted best and worst, by
+        `ImageMatch.score`; pr_curves.png, calibration.png, confusion.png.
+
+    Raises:
+        DataError: an image cannot be read; the message names it.
     """
     matches = match_images(results)
     by_id = {image.id: image for image in images}
     names = category_names(results.truth)
-    best, worst = ranked(matches, _IMAGES)
-    files = {
-        f"{which}.jpg": draw_tiles(
-            f"{which} of {len(matches)} validation images; {_SCORE}", chosen, by_id, names
-        )
-        for which, chosen in (("best", best), ("worst", worst))
-    }
+    best, worst = best_and_worst(matches, _NUM_IMAGES)
+    files = {}
+    for which, chosen in (("best", best), ("worst", worst)):
+        title = f"{which} of {len(matches)} validation images; {_SCORE}"
+        files[f"{which}.jpg"] = draw_tiles(title, chosen, by_id, names)
     counts = confusion_matrix(matches, len(names))
     return files | {
         "pr_curves.png": plot_precision_recall(results),
@@ -56,25 +60,27 @@ def draw_validation(results: Results, images: Iterable[CocoImage]) -> dict[str, 
     }
 
 
-def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files into a folder, which is made when it is not there."""
+def write_figures(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files into a folder, which is made where it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         write_bytes(folder / name, content)
 
 
-class ValidationPictures(Callback):
-    """Draws during a training: `folder` holds pictures of the validation that best.ckpt is from and
-    the losses so far, `folder/last` those of the last validation.
+class ValidationFigures(Callback):
+    """Draws figures during a training.
 
-    A picture that cannot be drawn is a warning with its traceback, never the end of a training.
+    `folder` holds those of the validation that best.ckpt is from and the losses so far,
+    `folder/last` those of the last validation. A figure that cannot be drawn is a warning with its
+    traceback, never the end of a training.
     """
 
     def __init__(self, folder: Path) -> None:
+        """Draw into a folder."""
         self.folder = folder
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw, in the first process, unless it was Lightning's trial before the training."""
+        """Draw in the first process, but not in Lightning's trial before the training."""
         if trainer.is_global_zero and not trainer.sanity_checking:
             _attempt(lambda: self._draw(trainer, pl_module))
 
@@ -85,13 +91,14 @@ class ValidationPictures(Callback):
 
     def _draw(self, trainer: Trainer, module: LightningModule) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        assert isinstance(module, MaskRCNNModule)
-        assert isinstance(data, CocoDataModule)
-        assert module.results is not None
+        if not isinstance(module, MaskRCNNModule) or not isinstance(data, CocoDataModule):
+            raise TypeError("figures are drawn of a MaskRCNNModule on a CocoDataModule only")
+        if module.results is None:
+            raise ValueError("the validation has no results")
         files = draw_validation(module.results, data.folder.val.images)
-        write_files(self.folder / "last", files)
+        write_figures(self.folder / "last", files)
         if _is_best(trainer):
-            write_files(self.folder, files)
+            write_figures(self.folder, files)
         self._draw_log(trainer)
 
     def _draw_log(self, trainer: Trainer) -> None:
@@ -100,12 +107,14 @@ class ValidationPictures(Callback):
                 logger.save()  # it holds back up to a hundred rows
                 log = Path(logger.log_dir) / "metrics.csv"
                 if log.is_file():
-                    write_files(self.folder, {"losses.png": plot_log(log)})
+                    write_figures(self.folder, {"losses.png": plot_log(log)})
 
 
 def _is_best(trainer: Trainer) -> bool:
-    """Whether the checkpoint that watches a score, and is written after this, will take this
-    validation for the best; without one every validation is."""
+    """Return whether the checkpoint that watches a score will choose this validation.
+
+    The checkpoint is written after the figures. Without one, every validation is the best.
+    """
     for checkpoint in trainer.checkpoint_callbacks:
         if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor is not None:
             best = checkpoint.best_model_score
@@ -116,9 +125,11 @@ def _is_best(trainer: Trainer) -> bool:
 
 
 def _attempt(draw: Callable[[], None]) -> None:
+    """Draw, and turn an error into a warning."""
     try:
         draw()
     except Exception:
         rank_zero_warn(
-            f"no pictures of this validation; the training goes on\n{traceback.format_exc()}"
+            "the figures of this validation could not be drawn; the training continues\n"
+            f"{traceback.format_exc()}"
         )

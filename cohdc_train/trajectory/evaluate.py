@@ -64,7 +64,7 @@ def evaluate(
     Args:
         groundtruth: TUM file of the true trajectory.
         estimate: TUM file of the estimated trajectory.
-        out: JSON file for the same numbers.
+        out: JSON file for the same numbers and the paths of both files.
         max_difference: largest difference of two timestamps of one moment, s.
 
     Raises:
@@ -86,5 +86,9 @@ def evaluate(
     if out is not None:
         out = Path(out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, result)
+        files = {
+            "groundtruth": str(Path(groundtruth).resolve()),
+            "estimate": str(Path(estimate).resolve()),
+        }
+        write_json(out, {**result, **files})  # `cohdc report` draws what lies there
     return result

@@ -1,6 +1,4 @@
-"""The HDC ResNet is torchvision's ResNet with other dilations: same tensors, same strides, whole
-coverage.
-"""
+"""Backbones against torchvision's: equal tensors and strides, other dilations, no holes."""
 
 import pytest
 import torch
@@ -17,7 +15,7 @@ PLAIN = ((1,),) * 4
 
 
 @pytest.mark.parametrize(("depth", "build"), [(18, resnet18), (50, resnet50)])
-def test_undilated_it_computes_what_torchvisions_resnet_computes(tmp_path, depth, build):
+def test_undilated_resnet_equals_torchvision(tmp_path, depth, build):
     torch.manual_seed(0)
     reference = build(weights=None).eval()
     torch.save(reference.state_dict(), tmp_path / "weights.pth")
@@ -40,14 +38,14 @@ def test_dilation_keeps_strides_and_channels(depth):
     ]
 
 
-def test_the_strided_convolution_keeps_rate_one_and_the_pattern_follows():
+def test_strided_convolution_keeps_rate_one_and_pattern_follows():
     backbone = HDCResNet(50)
     rates = [block.conv2.dilation[0] for block in backbone.layer3]
     assert rates == [1, 1, 2, 3, 1, 2]
     assert [block.conv2.dilation[0] for block in backbone.layer1] == [1, 2, 3]
 
 
-def test_a_pattern_with_holes_is_refused_by_the_backbone():
+def test_backbone_refuses_pattern_with_holes():
     with pytest.raises(ValueError, match="leave holes"):
         HDCResNet(18, rates=((2,), (1,), (1,), (1,)))
 
@@ -57,7 +55,7 @@ def test_three_patterns_are_refused():
         HDCResNet(18, rates=((1,),) * 3)
 
 
-def test_frozen_stages_learn_nothing_and_keep_their_statistics():
+def test_frozen_stages_keep_weights_and_statistics():
     backbone = HDCResNet(18, width=0.25, frozen_stages=2).train()
     before = {name: value.clone() for name, value in backbone.state_dict().items()}
     optimizer = torch.optim.SGD([p for p in backbone.parameters() if p.requires_grad], lr=1.0)
@@ -77,7 +75,7 @@ def test_weights_of_another_depth_are_refused_by_name(tmp_path):
         HDCResNet(18).load(str(tmp_path / "r50.pth"))
 
 
-def test_a_missing_file_lists_the_published_names(tmp_path):
+def test_missing_file_lists_the_published_names(tmp_path):
     with pytest.raises(FileNotFoundError, match="IMAGENET1K_V1"):
         HDCResNet(18).load(str(tmp_path / "nothing.pth"))
 
@@ -96,7 +94,7 @@ def test_mobilenets_strides_channels_and_pattern():
     assert not any(p.requires_grad for p in backbone.stem_block.parameters())
 
 
-def test_mobilenet_v2_computes_what_torchvisions_computes(tmp_path):
+def test_mobilenet_v2_equals_torchvision(tmp_path):
     torch.manual_seed(0)
     reference = mobilenet_v2(weights=None).eval()
     torch.save(reference.state_dict(), tmp_path / "v2.pth")
@@ -114,7 +112,7 @@ def test_mobilenet_v2_computes_what_torchvisions_computes(tmp_path):
 
 
 @pytest.mark.parametrize("rates", [((1,),) * 4, ((1,), (1,), (1, 2), (1, 2, 3))])
-def test_mobilenet_v2_keeps_strides_and_its_receptive_field_is_what_a_gradient_reaches(rates):
+def test_mobilenet_v2_strides_and_receptive_field_match_gradient(rates):
     body = MobileNetV2(width=0.25, rates=rates).eval()
     image = torch.rand(1, 3, 1536, 32, requires_grad=True)
     features = body(image)
@@ -125,7 +123,7 @@ def test_mobilenet_v2_keeps_strides_and_its_receptive_field_is_what_a_gradient_r
     assert side - 4 <= int(rows.max() - rows.min()) + 1 <= side
 
 
-def test_mobilenets_receptive_field_is_what_a_gradient_reaches():
+def test_mobilenet_v1_receptive_field_matches_gradient():
     body = MobileNetV1(width=0.25).eval()
     image = torch.rand(1, 3, 1024, 64, requires_grad=True)
     body(image)["3"][0, :, 16, 1].sum().backward()
@@ -134,14 +132,12 @@ def test_mobilenets_receptive_field_is_what_a_gradient_reaches():
 
 
 def test_mobilenet_sees_pixels_from_minus_one_to_one_padded_below_and_right():
-    """With a stem that copies its kernel's last corner, the stem's output is the pixel below and to
-    the right.
-    """
+    """Use a stem that copies its kernel's last corner: the pixel below and to the right."""
     body = MobileNetV1().eval()
     with torch.no_grad():
         body.stem_block.conv.weight.zero_()
         body.stem_block.conv.weight[:, 1, 1, 1] = (
-            1.0  # green, the kernel's centre: pixels 1, 3, 5 ...
+            1.0  # green, the kernel's center: pixels 1, 3, 5 ...
         )
     green = torch.arange(64.0).repeat(64, 1) / 63
     image = torch.stack([torch.zeros(64, 64), green, torch.zeros(64, 64)])
@@ -176,11 +172,11 @@ def test_mobilenets_weights_load_by_path_only(tmp_path):
     ("depth", "rates", "side"),
     [(18, [(1,)] * 4, 435), (50, [(1,)] * 4, 427), (34, [(1, 2, 3)] * 4, 1619)],
 )
-def test_the_receptive_field(depth, rates, side):
+def test_receptive_field(depth, rates, side):
     assert HDCResNet(depth, width=0.125, rates=rates).receptive_field() == side
 
 
-def test_the_receptive_field_is_what_a_gradient_reaches():
+def test_receptive_field_matches_gradient():
     body = HDCResNet(18, width=0.125, rates=[(1,), (1, 2, 3), (1,), (1,)]).eval()
     side = body.receptive_field()
     image = torch.rand(1, 3, 1024, 64, requires_grad=True)
@@ -189,7 +185,7 @@ def test_the_receptive_field_is_what_a_gradient_reaches():
     assert side - 4 <= int(rows.max() - rows.min()) + 1 <= side
 
 
-def test_frozen_norms_keep_half_precision_and_compute_torchvisions_values():
+def test_frozen_norms_keep_half_precision_and_equal_torchvision():
     norm, reference = FrozenNorm(5), FrozenBatchNorm2d(5)
     for name, buffer in norm.named_buffers():
         buffer.uniform_(0.5, 2.0)

@@ -25,7 +25,7 @@ def test_without_a_positive_the_loss_is_zero_and_reaches_every_parameter():
 
 
 @pytest.mark.parametrize("fusion", ["concat", "multiply", "add"])
-def test_the_head_learns_from_the_mask_it_is_shown(fusion):
+def test_head_learns_from_its_mask(fusion):
     torch.manual_seed(0)
     head = CQEHead(4, 1, channels=8, fc=16, fusion=fusion)
     features, masks = torch.rand(2, 4, 14, 14), torch.rand(2, 28, 28, requires_grad=True)
@@ -36,7 +36,7 @@ def test_the_head_learns_from_the_mask_it_is_shown(fusion):
     assert masks.grad.abs().sum() > 0
 
 
-def test_the_fusions_join_feature_and_mask_as_they_say():
+def test_fusions_join_feature_and_mask():
     feature, mask = torch.full((1, 2, 14, 14), 3.0), torch.zeros(1, 28, 28)
     mask[0, 0, 1] = 0.5  # the upper left cell's largest
     concat, multiply, add = (
@@ -54,7 +54,7 @@ def test_the_fusions_join_feature_and_mask_as_they_say():
 
 
 @pytest.mark.parametrize("fusion", ["concat", "multiply", "add"])
-def test_a_mask_of_56_cells_is_fused_like_its_own_half(fusion):
+def test_mask_of_56_cells_is_fused_like_one_of_28(fusion):
     torch.manual_seed(0)
     head = CQEHead(3, 2, channels=8, fc=16, fusion=fusion)
     features, mask = torch.rand(2, 3, 14, 14), torch.rand(2, 28, 28)

@@ -1,4 +1,4 @@
-"""CQE targets: known answers, Boundary IoU against faster-coco-eval, mini-masks against whole ones."""
+"""CQE targets: known answers, Boundary IoU against faster-coco-eval, and mini-masks."""
 
 import math
 
@@ -10,12 +10,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from cohdc_train.models.cqe_targets import band_of, boundary_iou, cqe_targets
-from cohdc_train.models.gt_masks import TrueMasks
+from cohdc_train.models.cqe_targets import boundary_band_px, boundary_iou, cqe_targets
+from cohdc_train.models.gt_masks import GroundTruthMasks
 
 
 def _true(masks):
-    return TrueMasks.of({"masks": masks}, torch.arange(len(masks)))
+    return GroundTruthMasks.from_target({"masks": masks}, torch.arange(len(masks)))
 
 
 def _scene(rows=slice(20, 60), columns=slice(10, 50)):
@@ -24,35 +24,33 @@ def _scene(rows=slice(20, 60), columns=slice(10, 50)):
     return truth
 
 
-def test_a_perfect_mask_in_a_tight_box_has_quality_one():
+def test_perfect_mask_in_a_tight_box_has_quality_one():
     box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_truth_outside_the_box_counts():
-    """The box holds half of the object and the mask fills it: IoU 1/2 with the whole, though 1
-    inside the box.
-    """
+    """Check a box on half of the object, filled by the mask: IoU 1/2 with the whole object."""
     box = torch.tensor([[10.0, 20.0, 30.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_mask_larger_than_the_object_is_punished():
+def test_mask_larger_than_the_object_is_punished():
     box = torch.tensor([[10.0, 20.0, 90.0, 60.0]])
     target = cqe_targets(torch.ones(1, 28, 28), box, _true(_scene()), torch.tensor([0]))
     assert target.item() == pytest.approx(0.5, abs=0.02)
 
 
-def test_an_empty_mask_has_quality_zero():
+def test_empty_mask_has_quality_zero():
     box = torch.tensor([[10.0, 20.0, 50.0, 60.0]])
     assert (
         cqe_targets(torch.zeros(1, 28, 28), box, _true(_scene()), torch.tensor([0])).item() == 0.0
     )
 
 
-def test_each_box_is_held_against_its_own_object():
+def test_each_box_is_compared_with_its_object():
     truth = torch.cat([_scene(), _scene(slice(60, 100), slice(60, 100))])
     boxes = torch.tensor([[60.0, 60.0, 100.0, 100.0], [10.0, 20.0, 50.0, 60.0]])
     target = cqe_targets(torch.ones(2, 28, 28), boxes, _true(truth), torch.tensor([1, 0]))
@@ -122,17 +120,17 @@ def _drawn(rectangles, size=(48, 64)):
 
 @settings(max_examples=60, deadline=None)
 @given(blobs, blobs)
-def test_boundary_iou_is_what_boundary_ap_counts(one, other):
+def test_boundary_iou_equals_faster_coco_eval(one, other):
     a, b = _drawn(one), _drawn(other)
     bands = [
         oracle.rleToBoundary(oracle.encode(np.asfortranarray(m.numpy(), dtype=np.uint8)))
         for m in (a, b)
     ]
     expected = float(oracle.iou([bands[0]], [bands[1]], [0])[0, 0]) if a.any() or b.any() else 0.0
-    assert boundary_iou(a, b, band_of(48, 64)).item() == pytest.approx(expected, abs=1e-6)
+    assert boundary_iou(a, b, boundary_band_px(48, 64)).item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_edge_of_the_image_is_contour():
+def test_image_edge_is_contour():
     half = _drawn([(0, 0, 48, 32)])
     inner = _drawn([(2, 2, 44, 28)])
     assert boundary_iou(half, half & ~inner, 2).item() == 1.0
@@ -158,9 +156,10 @@ def _laid_over(mask, box, size):
     st.integers(0, 99),
 )
 @example(rectangles=[(17, 1, 31, 2)], corner=(0.0, 18.0), extent=(4.0, 31.0), seed=2)
-def test_targets_on_the_canvas_are_those_of_the_pasted_mask(rectangles, corner, extent, seed):
-    """What `encode` pastes and Boundary AP scores is what the head is told, also where the box
-    leaves the canvas.
+def test_canvas_targets_equal_those_of_pasted_masks(rectangles, corner, extent, seed):
+    """Compare the targets with the masks that `encode_detections` pastes and Boundary AP scores.
+
+    The box leaves the canvas.
 
     Held against the paste's rule in double precision: OpenCV's own takes coordinates to a 32nd of a
     cell.
@@ -192,18 +191,18 @@ def _mini(mask, side=56):
     frame = torch.tensor(
         [[columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]], dtype=torch.float32
     )
-    whole = TrueMasks(mask[None], torch.tensor([[0.0, 0.0, mask.shape[1], mask.shape[0]]]))
-    rasters = whole.within(frame, torch.tensor([0]), (side, side)).half()
-    return TrueMasks.of({"masks": rasters, "frames": frame}, torch.tensor([0]))
+    whole = GroundTruthMasks(mask[None], torch.tensor([[0.0, 0.0, mask.shape[1], mask.shape[0]]]))
+    rasters = whole.coverage(frame, torch.tensor([0]), (side, side)).half()
+    return GroundTruthMasks.from_target({"masks": rasters, "frames": frame}, torch.tensor([0]))
 
 
-def test_a_mini_mask_stands_for_the_whole_one():
+def test_mini_mask_replaces_the_whole_one():
     y, x = torch.meshgrid(torch.arange(200), torch.arange(240), indexing="ij")
     disc = ((x - 100) ** 2 + (y - 90) ** 2 < 70**2) | ((x - 170).abs() + (y - 140).abs() < 40)
     box, matched = torch.tensor([[20.0, 30.0, 190.0, 170.0]]), torch.tensor([0])
     whole, mini = _true(disc[None].to(torch.uint8)), _mini(disc)
     assert mini.areas().item() == pytest.approx(whole.areas().item(), rel=2e-3)
-    exact, projected = (t.within(box, matched, (28, 28)) for t in (whole, mini))
+    exact, projected = (t.coverage(box, matched, (28, 28)) for t in (whole, mini))
     assert (exact - projected).abs().mean() < 0.01
     mask = (exact > 0.3).float()
     for kind in ("iou", "ciou", "boundary_iou", "min"):
@@ -212,23 +211,23 @@ def test_a_mini_mask_stands_for_the_whole_one():
 
 
 def test_projection_of_a_mini_mask_known_answer():
-    """A 2 x 2 mini-mask over 20 x 20 px whose left half is full: half of it, and nothing beside it."""
+    """Check a 2 x 2 mini-mask over 20 x 20 px whose left half is full."""
     target = {
         "masks": torch.tensor([[[1.0, 0.0], [1.0, 0.0]]]),
         "frames": torch.tensor([[10.0, 10.0, 30.0, 30.0]]),
     }
-    mini = TrueMasks.of(target, torch.tensor([0]))
+    mini = GroundTruthMasks.from_target(target, torch.tensor([0]))
     assert mini.areas().tolist() == [200.0]
     assert (
-        mini.within(torch.tensor([[10.0, 10.0, 30.0, 30.0]]), torch.tensor([0]), (1, 1)).item()
+        mini.coverage(torch.tensor([[10.0, 10.0, 30.0, 30.0]]), torch.tensor([0]), (1, 1)).item()
         == 0.5
     )
     assert (
-        mini.within(torch.tensor([[40.0, 10.0, 60.0, 30.0]]), torch.tensor([0]), (1, 1)).item()
+        mini.coverage(torch.tensor([[40.0, 10.0, 60.0, 30.0]]), torch.tensor([0]), (1, 1)).item()
         == 0.0
     )
 
 
 def test_frames_must_fit_the_rasters():
     with pytest.raises(ValueError, match="do not agree"):
-        TrueMasks(torch.zeros(2, 28, 28), torch.zeros(1, 4))
+        GroundTruthMasks(torch.zeros(2, 28, 28), torch.zeros(1, 4))

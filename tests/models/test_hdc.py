@@ -1,13 +1,11 @@
-"""Eq. 1 and exact coverage: known answers, and the truth by pushing an impulse through real
-convolutions.
-"""
+"""Eq. 1 and coverage: known answers, and an impulse through real convolutions."""
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cohdc_train.models.hdc import cycle, holes, max_distance, receptive_field
+from cohdc_train.models.hdc import cycle_rates, holes, max_distance, receptive_field
 
 
 @pytest.mark.parametrize(
@@ -31,7 +29,7 @@ def test_receptive_field_of_the_papers_rates():
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=4))
-def test_holes_are_what_an_impulse_through_convolutions_misses(rates):
+def test_holes_match_impulse_through_convolutions(rates):
     half = sum(rates)
     x = torch.zeros(1, 1, 4 * half + 1)
     x[..., 2 * half] = 1.0
@@ -41,14 +39,14 @@ def test_holes_are_what_an_impulse_through_convolutions_misses(rates):
     assert holes(rates) == unseen.tolist()
 
 
-def test_a_bad_pattern_is_refused_with_its_holes():
+def test_bad_pattern_is_refused_with_its_holes():
     with pytest.raises(
         ValueError, match=r"\(2, 2, 2, 2\) leave holes: offsets \+-\(1, 3, 5, 7\) px"
     ):
-        cycle((2,), 4)
+        cycle_rates((2,), 4)
 
 
 @pytest.mark.parametrize("pattern", [(), (0, 1), (1, -2)])
 def test_rates_below_one_are_refused(pattern):
     with pytest.raises(ValueError, match="at least 1"):
-        cycle(pattern, 3)
+        cycle_rates(pattern, 3)

@@ -1,6 +1,4 @@
-"""The network against torchvision's own Mask R-CNN, its losses at the edges, and that it can learn
-two pictures.
-"""
+"""The network against torchvision's Mask R-CNN, its losses at the edges, and overfitting."""
 
 import copy
 import dataclasses
@@ -17,6 +15,7 @@ from torchvision.ops import box_iou
 
 from cohdc_train.models import Detector, MaskRCNN, NetworkConfig, detect
 from cohdc_train.models.inference import cut_by_quality
+from cohdc_train.models.roi_losses import sample_proposals
 
 
 def _target(boxes, size=(96, 128), ignore=()):
@@ -64,7 +63,7 @@ def _assert_finds_what_torchvision_finds(network, image):
     assert torch.equal(found["labels"] + 1, expected["labels"])
 
 
-def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
+def test_padded_inference_equals_torchvision(opinionated):
     torch.manual_seed(1)
     image = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16), (96, 128))[0]
     image = (image * 255).to(torch.uint8)
@@ -72,9 +71,7 @@ def test_padded_inference_finds_what_torchvisions_detector_finds(opinionated):
 
 
 @pytest.mark.parametrize("backbone", ["mobilenet_v1", "mobilenet_v2"])
-def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector_finds(
-    backbone, small_config
-):
+def test_network_without_finest_level_learns_and_equals_torchvision(backbone, small_config):
     torch.manual_seed(0)
     changed = {
         "backbone": backbone,
@@ -96,7 +93,7 @@ def test_without_the_finest_level_it_learns_and_finds_what_torchvisions_detector
     _assert_finds_what_torchvision_finds(network, image)
 
 
-def test_anchors_equal_torchvisions(opinionated):
+def test_anchors_equal_torchvision(opinionated):
     generator = opinionated.rpn.anchor_generator
     grids = [(24, 32), (12, 16), (6, 8), (3, 4)]
     strides = [[torch.tensor(s), torch.tensor(s)] for s in (4, 8, 16, 32)]
@@ -109,7 +106,7 @@ def test_anchors_equal_torchvisions(opinionated):
 @pytest.mark.parametrize(
     "canvas", [(96, 128), (80, 120)]
 )  # the second is padded for the network, not for its anchors
-def test_proposals_and_their_losses_are_torchvisions(opinionated, canvas):
+def test_proposals_and_their_losses_equal_torchvision(opinionated, canvas):
     torch.manual_seed(3)
     images, rpn = torch.rand(2, 3, *canvas), copy.deepcopy(opinionated.rpn).train()
     targets = [_target([[10, 10, 60, 70], [64, 20, 118, 80]], canvas), _target([], canvas)]
@@ -146,10 +143,8 @@ def test_padding_is_zero_and_scores_fall(opinionated):
 
 
 @given(seed=st.integers(0, 2**32 - 1), sharpness=st.floats(1.0, 4.0))
-def test_a_mask_cut_by_the_best_expected_iou_is_the_mask_that_has_it(seed, sharpness):
-    """Of all cuts of one mask, tried one by one. Expected: of the intersection over that of the
-    union.
-    """
+def test_quality_cut_maximizes_expected_iou(seed, sharpness):
+    """Try all cuts of one mask; expected IoU: expected intersection over expected union."""
     p = (
         sharpness * torch.randn(12, 12, generator=torch.Generator().manual_seed(seed)).double()
     ).sigmoid()
@@ -161,13 +156,13 @@ def test_a_mask_cut_by_the_best_expected_iou_is_the_mask_that_has_it(seed, sharp
     assert torch.equal(cut, p > best_first[best + 1])
 
 
-def test_a_perfect_mask_is_cut_at_half_and_no_mask_below_a_fifth():
+def test_perfect_mask_is_cut_at_half_and_none_below_a_fifth():
     p = torch.linspace(0, 1, 101).reshape(1, 1, -1)
     torch.testing.assert_close(cut_by_quality(p, torch.ones(1)), p)
     assert p[cut_by_quality(p, torch.zeros(1)) > 0.5].min().item() == pytest.approx(0.21)
 
 
-def test_cutting_by_quality_moves_masks_and_nothing_else(opinionated):
+def test_quality_cut_changes_masks_only(opinionated):
     images = torch.randint(
         0, 255, (1, 80, 60, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
     )
@@ -186,7 +181,7 @@ def test_cutting_by_quality_moves_masks_and_nothing_else(opinionated):
     assert (moved[0, :n] - masks[0, :n]).max() > 0.01
 
 
-def test_only_detections_go_through_the_mask_and_cqe_heads(opinionated):
+def test_mask_and_cqe_heads_see_detections_only(opinionated):
     passed = {"mask": 0, "cqe": 0}
     heads = {"mask": opinionated.roi_heads.mask_head, "cqe": opinionated.cqe}
     hooks = [
@@ -221,7 +216,7 @@ def test_boxes_stay_inside_an_image_of_any_shape(opinionated):
 
 
 @pytest.mark.parametrize("head_norm", ["none", "batch"])
-def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter(
+def test_losses_of_images_without_objects_are_finite_and_reach_every_parameter(
     small_config, head_norm
 ):
     network = MaskRCNN(1, dataclasses.replace(small_config, head_norm=head_norm))
@@ -233,7 +228,7 @@ def test_losses_of_pictures_without_objects_are_finite_and_reach_every_parameter
     assert all(torch.isfinite(value).all() for value in network.state_dict().values())
 
 
-def test_new_norms_are_trained_beside_a_frozen_backbone(small_config):
+def test_head_norms_are_trained_with_a_frozen_backbone(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, norm="frozen", head_norm="batch"))
     trained = [
         name for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)
@@ -246,7 +241,7 @@ def test_new_norms_are_trained_beside_a_frozen_backbone(small_config):
     assert not [name for name in trained if name.startswith("backbone.body")]
 
 
-def test_a_canvas_that_is_no_multiple_of_32_is_padded(small_config):
+def test_canvas_that_is_no_multiple_of_32_is_padded(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, canvas=(90, 100)))
     losses = network.losses(torch.rand(1, 3, 90, 100), [_target([[10, 10, 60, 70]], (90, 100))])
     assert all(torch.isfinite(loss) for loss in losses.values())
@@ -267,7 +262,7 @@ def test_background_inside_a_crowd_is_no_negative(small_config):
     assert labels[1] == [0.0, -1.0, 1.0]
 
 
-def test_the_target_of_the_quality_changes_its_loss_and_nothing_else(small_config):
+def test_quality_target_changes_its_loss_only(small_config):
     losses = []
     for goal in ("iou", "ciou", "boundary_iou", "min"):
         torch.manual_seed(0)
@@ -288,14 +283,14 @@ def test_boxes_keep_their_pixels_in_mixed_precision(small_config):
         losses = network.losses(torch.rand(1, 3, 96, 1024), targets)
         features = network.features(torch.rand(1, 3, 96, 1024))
         proposals, *_ = network.rpn((96, 1024), list(features.values()), targets, 100)
-        sampled, _, _, _ = network._sample(proposals, targets)
+        sampled = sample_proposals(network.roi_heads, proposals, targets).boxes
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert features["0"].dtype == torch.bfloat16
     assert sampled[0].dtype == network.rpn.anchors(0, features["0"]).dtype == torch.float32
     assert (sampled[0] == targets[0]["boxes"][0]).all(dim=1).any()
 
 
-def test_masks_of_56_cells_train_and_are_given(small_config):
+def test_masks_of_56_cells_train_and_infer(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, mask_size=56, cqe="add"))
     sum(
         network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])]).values()
@@ -305,7 +300,7 @@ def test_masks_of_56_cells_train_and_are_given(small_config):
     assert found["masks"].shape[1:] == (56, 56)
 
 
-def test_mini_masks_give_the_losses_of_whole_ones(small_config):
+def test_mini_masks_give_equal_losses(small_config):
     corners = [[10, 10, 60, 70], [64, 20, 120, 90]]
     whole = _target(corners)
     mini = {**whole, "masks": torch.ones(2, 28, 28), "frames": whole["boxes"]}
@@ -318,7 +313,7 @@ def test_mini_masks_give_the_losses_of_whole_ones(small_config):
         assert loss.item() == pytest.approx(losses[1][name].item(), rel=0.02)
 
 
-def test_cqe_can_be_left_out(small_config):
+def test_network_without_cqe_has_quality_one(small_config):
     network = MaskRCNN(1, dataclasses.replace(small_config, cqe="off"))
     assert "cqe" not in network.losses(torch.rand(1, 3, 96, 128), [_target([[10, 10, 60, 70]])])
     found = detect(network.eval(), [torch.randint(0, 255, (3, 96, 128), dtype=torch.uint8)])[0]
@@ -336,23 +331,21 @@ def test_cqe_can_be_left_out(small_config):
         ({"mask_cut": "quality", "cqe_target": "boundary_iou"}, "mask_cut quality"),
     ],
 )
-def test_a_config_that_cannot_be_built_is_refused(change, message):
+def test_config_that_cannot_be_built_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         NetworkConfig(**change)
 
 
-def test_it_learns_two_pictures_and_its_quality_tells_the_truth(small_config):
-    """Overfit: after a hundred steps both boxes are found, masks fit, and CQE's estimate is near
-    the true IoU.
-    """
+def test_network_learns_two_images_and_their_quality(small_config):
+    """Overfit for a hundred steps: boxes are found, masks fit, and CQE is near the true IoU."""
     torch.manual_seed(0)
     network = MaskRCNN(
         1, dataclasses.replace(small_config, width=0.5, fpn_channels=32, fc=64, score_threshold=0.3)
     )
-    pictures = torch.full((2, 3, 96, 128), 0.3)
+    images = torch.full((2, 3, 96, 128), 0.3)
     corners = [[20, 16, 60, 80], [70, 30, 116, 70]]
-    for picture, (x0, y0, x1, y1) in zip(pictures, corners, strict=True):
-        picture[:, y0:y1, x0:x1] = torch.tensor([0.9, 0.2, 0.1])[:, None, None]
+    for image, (x0, y0, x1, y1) in zip(images, corners, strict=True):
+        image[:, y0:y1, x0:x1] = torch.tensor([0.9, 0.2, 0.1])[:, None, None]
     targets = [_target([corner]) for corner in corners]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
     schedule = torch.optim.lr_scheduler.LinearLR(
@@ -360,10 +353,10 @@ def test_it_learns_two_pictures_and_its_quality_tells_the_truth(small_config):
     )  # to end where it has settled
     for _ in range(100):
         optimizer.zero_grad()
-        sum(network.losses(pictures, targets).values()).backward()
+        sum(network.losses(images, targets).values()).backward()
         optimizer.step()
         schedule.step()
-    found = detect(network.eval(), list((pictures * 255).to(torch.uint8)))
+    found = detect(network.eval(), list((images * 255).to(torch.uint8)))
     for result, target in zip(found, targets, strict=True):
         assert box_iou(result["boxes"][:1], target["boxes"]).item() > 0.8
         assert (result["masks"][0] > 0.5).float().mean() > 0.9

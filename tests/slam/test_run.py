@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
@@ -68,7 +69,7 @@ def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
 def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequence: Path) -> None:
     names = {path.name for path in masked.iterdir()}
     tables = {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", MANIFEST}
-    assert names == tables | {"map.ply", "map.png", "pictures"}
+    assert names == tables | {"map.ply", "map.png", "pictures", "report.html"}
     assert [path.name for path in masked.parent.iterdir()] == ["run"], "no temporary folder is left"
     trajectory, truth = (
         Trajectory.load_tum(masked / "trajectory.txt"),
@@ -163,8 +164,10 @@ def test_print_config_shows_the_options_and_runs_nothing(
 
 
 def test_pictures_show_what_was_culled(masked: Path) -> None:
-    names = sorted(path.name for path in (masked / "pictures").iterdir())
-    assert len(names) == 12
+    names = [path.name for path in (masked / "pictures").iterdir()]
+    kinds = Counter(name.rpartition("_")[2] for name in names)
+    assert kinds.pop("worst.jpg") >= 1
+    assert kinds == {"before.jpg": 6, "after.jpg": 6}
     before = cv2.imread(str(masked / "pictures" / "100.000000_before.jpg"))
     after = cv2.imread(str(masked / "pictures" / "100.000000_after.jpg"))
     assert before.shape == after.shape == (240, 320, 3)
@@ -184,7 +187,8 @@ def test_without_masks_or_geometry_the_passer_by_spoils_it(
     )
     assert metrics["ate_m"]["rmse"] > 5 * good
     assert metrics["ms"]["segment"]["p95"] == 0
-    assert len(list((tmp_path / "pictures").iterdir())) == 6
+    assert len(list((tmp_path / "pictures").glob("*_before.jpg"))) == 6
+    assert not list((tmp_path / "pictures").glob("*_after.jpg"))
 
 
 def test_run_keeps_files_it_did_not_write(
@@ -213,13 +217,14 @@ def test_second_run_replaces_its_files_removes_stale_ones_and_keeps_the_rest(
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     slam(write_sequence(long, 8), out=out, settings=slam_config(200), dense_cloud=True)
-    pictures = set(files_below(out / "pictures"))
+    pictures = {name for name in files_below(out / "pictures") if "worst" not in name}
     assert (out / "cloud.ply").is_file()
     (out / "pictures" / "holiday.jpg").write_text("mine")
     slam(write_sequence(short, 2), out=out, settings=slam_config(200))
     assert json.loads((out / "metrics.json").read_text())["frames"] == 2
     assert not (out / "cloud.ply").exists()
-    assert set(files_below(out / "pictures")) < pictures | {"holiday.jpg"}
+    left = {name for name in files_below(out / "pictures") if "worst" not in name}
+    assert left < pictures | {"holiday.jpg"}
     assert {(out / name).read_text() for name in ("mine.txt", "pictures/holiday.jpg")} == {"mine"}
     (out / "cloud.ply").write_text("mine")
     assert main(["slam", str(short), "--out", str(out), "--dense_cloud"]) == 1

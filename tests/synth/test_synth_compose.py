@@ -12,7 +12,7 @@ import yaml
 
 from cohdc_train.cli import main
 from cohdc_train.slam.geometry.camera import Camera
-from cohdc_train.slam.io.tum import Entry
+from cohdc_train.slam.io.tum import TimestampedImage
 from cohdc_train.synth.cut_outs import (
     RELIEF_M,
     CutOut,
@@ -68,7 +68,8 @@ def test_nearer_surface_hides_a_person_and_other_pixels_stay(tmp_path: Path) -> 
     depth[:, :20] = 0
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     cv2.imwrite(str(tmp_path / "c.png"), np.full((120, 160, 3), 120, np.uint8))
-    pair = Entry(0.0, "0", tmp_path / "c.png"), Entry(0.0, "0", tmp_path / "d.png")
+    color, depth_image = tmp_path / "c.png", tmp_path / "d.png"
+    pair = TimestampedImage(0.0, "0", color), TimestampedImage(0.0, "0", depth_image)
     layers = [render(*standing(2.0), 0.0, LEVEL, pixel_rays(CAMERA, 1))]
     rgb, units, mask = compose_frame(pair, CAMERA, layers, np.random.default_rng(0))
     assert mask[:58].any()

@@ -1,6 +1,4 @@
-"""What the tests of distributed training put into `cohdc fit`: a callback that writes down what
-each rank saw.
-"""
+"""Callback for the tests of distributed training, which writes down what each rank saw."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ from cohdc_train.train import module
 class Probe(pl.Callback):
     """Writes `rankN.pt`: the losses of every step, the validation scores and the trained weights.
 
-    Validation is on detections made of the toy images' colours: a network of a few steps would not
+    Validation is on detections made of the toy images' colors: a network of a few steps would not
     give any.
     apart: a fault on purpose, every rank keeps its own gradients.
     """
@@ -53,14 +51,12 @@ class Probe(pl.Callback):
 
 
 def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
-    """One detection per colour of the toy images, off by an amount that follows from the image's
-    pixels.
-    """
+    """Return one detection per color of the toy images, off by what their pixels determine."""
     found = []
     for image in images:
         boxes, labels = [], []
-        for label, colour in enumerate(coco_toys.COLOURS.values()):
-            inside = (image == torch.tensor(colour)[:, None, None]).all(dim=0)
+        for label, color in enumerate(coco_toys.COLORS.values()):
+            inside = (image == torch.tensor(color)[:, None, None]).all(dim=0)
             rows, columns = inside.any(dim=1).nonzero()[:, 0], inside.any(dim=0).nonzero()[:, 0]
             if len(rows):
                 boxes.append(
@@ -85,7 +81,7 @@ def see(network: Any, images: list[Tensor]) -> list[dict[str, Tensor]]:
 def _keep_own_gradients(
     state: Any, bucket: torch.distributed.GradBucket
 ) -> torch.futures.Future[Tensor]:
-    """A communication hook that does not communicate."""
+    """Replace the communication of gradients by none."""
     kept: torch.futures.Future[Tensor] = torch.futures.Future()
     kept.set_result(bucket.buffer())
     return kept

@@ -6,12 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from cohdc_train.train.budget import (
-    auto_precision,
-    default_epochs,
-    training_limits,
-    validation_interval,
-)
+from cohdc_train.train.budget import default_epochs, training_limits, validation_interval
+from cohdc_train.train.trainer import auto_precision
 
 
 def limits(

@@ -97,7 +97,7 @@ def test_given_backbone_weights_come_before_the_shipped_network() -> None:
     assert (initial.kind, initial.source) == ("backbone", "mine.pth")
 
 
-def test_files_are_told_apart_by_their_content(tmp_path: Path) -> None:
+def test_files_are_distinguished_by_content(tmp_path: Path) -> None:
     state, checkpoint, other = (
         tmp_path / name for name in ("state.pth", "best.ckpt", "other.ckpt")
     )
@@ -115,7 +115,7 @@ def test_files_are_told_apart_by_their_content(tmp_path: Path) -> None:
         choose_initial_weights("persn", network)
 
 
-def test_resuming_takes_what_the_checkpoint_had(tmp_path: Path) -> None:
+def test_resume_keeps_norm_and_stages_of_the_checkpoint(tmp_path: Path) -> None:
     last = tmp_path / "last.ckpt"
     hyper = {"network": {"norm": "frozen", "frozen_stages": 3}, "optimizer": {"backbone_lr": 0.2}}
     torch.save({"hyper_parameters": hyper, "state_dict": {}, "loops": {}}, last)

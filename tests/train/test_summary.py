@@ -74,7 +74,7 @@ def test_summary_names_scores_files_and_next_command(tmp_path: Path) -> None:
     ]
 
 
-def test_summary_tells_a_better_checkpoint_of_an_earlier_session(tmp_path: Path) -> None:
+def test_summary_names_a_better_checkpoint_of_an_earlier_session(tmp_path: Path) -> None:
     (first, *_) = summary_lines(HEALTHY, tmp_path, best_ap=0.335)
     assert first == "best.ckpt: mask AP 0.335, of an earlier session; this one reached 0.300"
     (same, *_) = summary_lines(HEALTHY, tmp_path, best_ap=0.3)

@@ -1,6 +1,4 @@
-"""The shipped Table 3 configurations against the paper's table, and every configuration through the
-command line.
-"""
+"""Table 3's configs against the paper's table, and all configs through the command line."""
 
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,7 @@ TABLE = {
 
 
 @pytest.mark.parametrize("test", TABLE)
-def test_a_configuration_holds_its_column_and_nothing_else(test: int) -> None:
+def test_config_has_the_values_of_its_column_only(test: int) -> None:
     train, val, epochs, (width, height), mini, scale, lr, pretrained = TABLE[test]
     network: dict[str, Any] = {
         "backbone": "resnet",
@@ -68,7 +66,7 @@ def holds(resolved: Any, given: Any) -> bool:
 @pytest.mark.parametrize(
     "name", ["person.yaml", "table4.yaml", *NETWORKS, *(f"table3/test{i:02d}.yaml" for i in TABLE)]
 )
-def test_a_configuration_parses_and_resolves(
+def test_config_parses_and_resolves(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     with pytest.raises(SystemExit) as stop:
@@ -78,7 +76,7 @@ def test_a_configuration_parses_and_resolves(
     assert holds(yaml.safe_load(capsys.readouterr().out), given)
 
 
-def test_a_network_and_a_recipe_add_up(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_network_and_recipe_combine(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     both = ["--config=networks/hdc_net_n.yaml", "--config", "person.yaml"]
     with pytest.raises(SystemExit):
         fit([*both, f"--data.root={tmp_path}", "--print_config"])

@@ -25,7 +25,7 @@ import torch
 from cohdc_train.contour import Polygon, count_vertices, rasterize, simplify, trace
 from cohdc_train.data.datamodule import CocoDataModule
 from cohdc_train.files import write_bytes, write_json, write_text
-from cohdc_train.models.cqe_targets import band_of, boundary_iou
+from cohdc_train.models.cqe_targets import boundary_band_px, boundary_iou
 from cohdc_train.prediction.image_sources import read_images
 from cohdc_train.segmenter import Segmenter
 from cohdc_train.synth.coco import coco
@@ -152,7 +152,9 @@ def measured(
         filled = rasterize(outline, mask.shape)
         edges.append(
             float(
-                boundary_iou(torch.from_numpy(filled), torch.from_numpy(mask), band_of(*mask.shape))
+                boundary_iou(
+                    torch.from_numpy(filled), torch.from_numpy(mask), boundary_band_px(*mask.shape)
+                )
             )
         )
     texts = [

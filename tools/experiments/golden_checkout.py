@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
-# Options of `cohdc slam` and of tools that got another name. The cases use the old one.
+# Options of `cohdc` and of tools that got another name. The cases use the old one.
 # Old name: new name; an empty one for an option whose value became positional.
 RENAMED_OPTIONS = {
     "--sequence": "",
@@ -36,6 +36,7 @@ RENAMED_OPTIONS = {
     "--method.smoothing": "--settings.smoothing.enabled",
     "--method.keyframe_culling": "--settings.keyframe_culling.enabled",
     "--method.flow": "--settings.flow.enabled",
+    "--pictures": "--figures",
 }
 # Where a program lies, the newest place first, relative to a checkout.
 _TOOL_PLACES = {"late_masks": ("tools/experiments/late_masks.py", "tools/late_masks")}
@@ -111,7 +112,7 @@ class Checkout:
     def _translate(self, command: list[str]) -> list[str]:
         """Return the arguments of a command with options named as this checkout names them."""
         arguments = command[1:]
-        if not RENAMED_OPTIONS.keys() & set(arguments):
+        if not RENAMED_OPTIONS.keys() & {word.partition("=")[0] for word in arguments}:
             return arguments
         verb = arguments[:1] if command[0] == "cohdc" else []
         key = (command[0], *verb)
@@ -138,7 +139,8 @@ def translate(arguments: list[str], help_text: str) -> list[str]:
     """Replace old names of options that a help text does not know by their new names."""
     known = set(re.findall(r"--[\w.]+", help_text))
     renames = {old: new for old, new in RENAMED_OPTIONS.items() if old not in known}
-    words = [renames.get(word, word) for word in arguments]
+    names_and_values = (word.partition("=") for word in arguments)
+    words = [renames.get(name, name) + equals + value for name, equals, value in names_and_values]
     return [word for word in words if word]
 
 

@@ -247,17 +247,17 @@ def score_ours(module: Any, data: Path) -> dict[str, float]:
 
     from cohdc_train.data.annotations import read_image
     from cohdc_train.data.datamodule import CocoDataModule
-    from cohdc_train.metrics.coco_metrics import encode
-    from cohdc_train.models import detect, fused
+    from cohdc_train.metrics.detection_rows import encode_detections
+    from cohdc_train.models import detect, fuse_conv_bn
 
     split = CocoDataModule(data, module.class_names).folder.val
-    network = fused(module.network)
+    network = fuse_conv_bn(module.network)
     images = Images(split, flip=0.0)
     rows: list[dict[str, Any]] = []
     for image in split.images:
         pixels = torch.from_numpy(read_image(image)).permute(2, 0, 1)
         (detections,) = detect(network, [pixels])
-        for row in encode(image.id, (image.height, image.width), detections):
+        for row in encode_detections(image.id, (image.height, image.width), detections):
             label = row["category_id"]
             wanted = {key: row[key] for key in ("image_id", "bbox", "segmentation")}
             rows.append(

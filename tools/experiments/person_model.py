@@ -126,7 +126,7 @@ def untrained(size: str, canvas: tuple[int, int], began: Path, out: Path) -> Pat
         shape |= yaml.safe_load(config_path(name).read_text(encoding="utf-8"))["model"]["network"]
     fields = {**shape, "norm": "frozen", "frozen_stages": 2, "canvas": canvas}
     module = MaskRCNNModule(["person"], NetworkConfig(**fields))
-    module.take_over(began)
+    module.load_pretrained(began)
     torch.save({"hyper_parameters": dict(module.hparams), "state_dict": module.state_dict()}, out)
     return out
 
@@ -138,7 +138,7 @@ def mean_with_start(ended: Path, began: Path, out: Path) -> Path:
         torch.load(ended, map_location="cpu", weights_only=True),
     )
     last = {name: weights.clone() for name, weights in module.network.state_dict().items()}
-    module.take_over(began)
+    module.load_pretrained(began)
     for name, weights in module.network.state_dict().items():
         if weights.is_floating_point():
             stored["state_dict"][f"network.{name}"] = (weights + last[name]) / 2

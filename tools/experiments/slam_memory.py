@@ -109,7 +109,7 @@ def shrunk(camera: Camera, by: int) -> Camera:
 
 
 def small(view: RGBDFrame, camera: Camera, by: int) -> tuple[np.ndarray, np.ndarray]:
-    """Color, and depth as it is stored."""
+    """Return color, and depth as it is stored."""
     rgb = cv2.resize(view.rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return rgb, np.rint(view.depth[by // 2 :: by, by // 2 :: by] * camera.depth_scale).astype(
         np.uint16

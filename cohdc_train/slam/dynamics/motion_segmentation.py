@@ -45,7 +45,7 @@ class StaticPose(NamedTuple):
 
 
 class _PosesWithout(NamedTuple):
-    """Poses that result when one cluster is left out.
+    """Poses that result when one cluster is excluded.
 
     steps: [g, 6] twist from the pose of all points; covariances: [g, 6, 6].
     """

@@ -209,7 +209,7 @@ def test_camera_of_the_caller_is_tracked(tmp_path: Path) -> None:
 
 
 class RealSense(ModuleType):
-    """Stand-in for pyrealsense2, as docs/live.md uses it, with a camera of five frames."""
+    """Stand-in for pyrealsense2 as the how-to page uses it: a camera of five frames."""
 
     def __init__(self) -> None:
         super().__init__("pyrealsense2")
@@ -245,7 +245,8 @@ class RealSense(ModuleType):
 
 
 def test_example_of_the_documentation_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
+    page = Path(__file__).parents[3] / "docs" / "how-to" / "live-camera.md"
+    text = page.read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     monkeypatch.setitem(sys.modules, "pyrealsense2", RealSense())
     monkeypatch.chdir(tmp_path)
