@@ -21,12 +21,13 @@ from cohdc_train.slam.io.live import stop_on_sigint
 from cohdc_train.slam.io.results import (
     check_output_dir,
     compute_metrics,
+    format_summary,
     move_into_place,
     write_run,
 )
 from cohdc_train.slam.io.sequence import choose_format
 from cohdc_train.slam.io.sources import FrameSource, RecordedSequence
-from cohdc_train.slam.runner import RunObserver, track_sequence
+from cohdc_train.slam.runner import RunObserver, TrackedSequence, track_sequence
 from cohdc_train.slam.runtime.threads import single_threaded
 from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
 from cohdc_train.slam.system import Slam
@@ -170,74 +171,30 @@ def run_slam(
         with ExitStack() as stack:
             workers = None
             if options.realtime:
-                workers = stack.enter_context(
-                    start_workers(source, make_masks, settings.masks, settings.realtime)
-                )
+                parallel = start_workers(source, make_masks, settings.masks, settings.realtime)
+                workers = stack.enter_context(parallel)
             slam_system = _build_slam(source.camera, settings, workers)
             files = stack.enter_context(_map_files(source.camera, part, settings, options))
             worst_frames = WorstFrames()
-            watching: list[RunObserver] = [files, worst_frames, *observers]
-            if options.viewer or options.rrd is not None:
-                viewer = RerunViewer(source.camera, files.colors, options.viewer, options.rrd)
-                watching.append(stack.enter_context(viewer))
+            viewers = _open_viewer(stack, source.camera, files, options)
             stack.enter_context(stop_on_sigint(source))
             tracked = track_sequence(
                 slam_system,
                 workers.source if workers else source,
                 workers.mask_of if workers else make_masks or no_masks,
                 part / "pictures",
-                watching,
+                [files, worst_frames, *observers, *viewers],
                 workers.report_latency(on_pose) if workers else on_pose,
             )
             files.write(slam_system.map, tracked.trajectory)
             worst_frames.write(part / "pictures")
-        metrics: dict[str, Any] = {
-            "seed": settings.seed,
-            "realtime": options.realtime,
-            "loops": slam_system.num_loops,
-            "without_depth": source.num_unpaired,
-            "keyframes_in_map": len(slam_system.map.keyframes),
-        }
-        dropped = workers.source.dropped if workers else 0
-        metrics |= compute_metrics(tracked.records, tracked.trajectory, truth, dropped)
-        if workers is not None:
-            # Masks are propagated to each frame; the segmenter's own time is segmenter_ms.
-            stages = metrics["ms"].items()
-            metrics["ms"] = {"mask" if k == "segment" else k: v for k, v in stages}
-            metrics |= workers.metrics()
+        metrics = _metrics(slam_system, tracked, workers, truth, source.num_unpaired)
         inputs = {"sequence": sequence, "model": model, "masks": masks}
         config = _config_text(inputs, source.camera, settings, options)
         write_run(part, tracked.records, tracked.trajectory, metrics, config)
         move_into_place(part, out)
-    print(f"{summary(metrics)}\nwritten to {out}")
+    print(f"{format_summary(metrics)}\nwritten to {out}")
     return metrics
-
-
-def summary(metrics: dict[str, Any]) -> str:
-    """Return the small table at the end of a run."""
-    tracked = f"{metrics['tracked']} of {metrics['frames']} tracked"
-    in_map = f"{metrics['keyframes_in_map']} of them in the map at the end"
-    rows = [
-        ("frames", f"{tracked} ({100 * metrics['coverage']:.1f} %)"),
-        ("keyframes", f"{metrics['keyframes']}, {in_map}"),
-        ("loops closed", str(metrics["loops"])),
-        ("frames/s", f"{metrics['fps']:.1f}"),
-    ]
-    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
-    if metrics["realtime"]:
-        rows.append(("dropped", str(metrics["dropped"])))
-        names = {
-            "segmenter_ms": "segmenter ms",
-            "mask_age_ms": "mask age ms",
-            "latency_ms": "latency ms",
-        }
-        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
-    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
-    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
-        if key in metrics:
-            values = [f"{name} {value:.4f}" for name, value in metrics[key].items()]
-            rows.append((key, "  ".join(values)))
-    return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
 def _open_folder(folder: Path, settings: SlamConfig, options: RunOptions) -> FrameSource:
@@ -286,6 +243,41 @@ def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers |
         executor=workers.executor,
         frame_time_used=workers.source.frame_time_used,
     )
+
+
+def _open_viewer(
+    stack: ExitStack, camera: Camera, files: MapFiles, options: RunOptions
+) -> list[RunObserver]:
+    """Open the viewer where it is asked for."""
+    if not options.viewer and options.rrd is None:
+        return []
+    viewer = RerunViewer(camera, files.colors, options.viewer, options.rrd)
+    return [stack.enter_context(viewer)]
+
+
+def _metrics(
+    slam_system: Slam,
+    tracked: TrackedSequence,
+    workers: RealtimeWorkers | None,
+    truth: Trajectory | None,
+    num_unpaired: int,
+) -> dict[str, Any]:
+    """Return the content of metrics.json."""
+    metrics: dict[str, Any] = {
+        "seed": slam_system.config.seed,
+        "realtime": workers is not None,
+        "loops": slam_system.num_loops,
+        "without_depth": num_unpaired,
+        "keyframes_in_map": len(slam_system.map.keyframes),
+    }
+    dropped = 0 if workers is None else workers.source.dropped
+    metrics |= compute_metrics(tracked.records, tracked.trajectory, truth, dropped)
+    if workers is not None:
+        # Masks are propagated to each frame; the segmenter's own time is segmenter_ms.
+        stages = metrics["ms"].items()
+        metrics["ms"] = {"mask" if name == "segment" else name: ms for name, ms in stages}
+        metrics |= workers.metrics()
+    return metrics
 
 
 def _config_text(

@@ -121,6 +121,33 @@ def _row(record: FrameRecord) -> list[object]:
     ]
 
 
+def format_summary(metrics: dict[str, Any]) -> str:
+    """Return the small table at the end of a run."""
+    tracked = f"{metrics['tracked']} of {metrics['frames']} tracked"
+    in_map = f"{metrics['keyframes_in_map']} of them in the map at the end"
+    rows = [
+        ("frames", f"{tracked} ({100 * metrics['coverage']:.1f} %)"),
+        ("keyframes", f"{metrics['keyframes']}, {in_map}"),
+        ("loops closed", str(metrics["loops"])),
+        ("frames/s", f"{metrics['fps']:.1f}"),
+    ]
+    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
+    if metrics["realtime"]:
+        rows.append(("dropped", str(metrics["dropped"])))
+        names = {
+            "segmenter_ms": "segmenter ms",
+            "mask_age_ms": "mask age ms",
+            "latency_ms": "latency ms",
+        }
+        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
+    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
+    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
+        if key in metrics:
+            values = [f"{name} {value:.4f}" for name, value in metrics[key].items()]
+            rows.append((key, "  ".join(values)))
+    return "\n".join(f"  {name:<16}{text}" for name, text in rows)
+
+
 def move_into_place(part: Path, out: Path) -> None:
     """Move the files of a run into the output folder, in place of those of a former run.
 
