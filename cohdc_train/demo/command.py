@@ -80,8 +80,8 @@ def closing_lines(summary: dict[str, Any], out: Path) -> str:
     return "\n".join(
         [
             "",
-            f"With masks of the fine-tuned network the trajectory error is {ratio:.0f} times smaller"
-            " than with plain RGB-D SLAM.",
+            "With the network's masks the trajectory error is"
+            f" {ratio:.0f} times smaller than with plain RGB-D SLAM.",
             "",
             f"  {'':<26}{'error (ATE)':>12}{'tracked':>13}",
             *rows,

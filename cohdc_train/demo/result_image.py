@@ -6,10 +6,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cohdc_train.demo.steps import RUNS
+from cohdc_train.images import read_rgb
+from cohdc_train.trajectory.association import match
+from cohdc_train.trajectory.metrics import align_umeyama
+from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_LONGEST_GAP_S = 0.1  # a longer pause between two poses is left open
 COLORS = {"plain": "#c0392b", "geometry": "#d68910", "masks": "#1f77b4"}
 
 
@@ -33,29 +39,24 @@ def draw_result(out: Path, metrics: dict[str, Any]) -> None:
 
 def _draw_frame(axes: "Axes", out: Path) -> None:
     """Show the stored frame in which the dynamic mask covers most."""
-    import cv2
-
     images = sorted((out / "slam" / "masks" / "pictures").glob("*_after.jpg"))
-    image = cv2.cvtColor(cv2.imread(str(images[len(images) // 2])), cv2.COLOR_BGR2RGB)
-    axes.imshow(image)
+    image = read_rgb(images[len(images) // 2])
+    if image is not None:
+        axes.imshow(image)
     axes.set_title("Dynamic mask of the fine-tuned network, and the keypoints that SLAM keeps")
     axes.axis("off")
 
 
 def _draw_trajectories(axes: "Axes", out: Path, metrics: dict[str, Any]) -> None:
     """Draw the camera's path from above: ground truth and three estimates, aligned to it."""
-    from cohdc_train.trajectory.association import match
-    from cohdc_train.trajectory.metrics import align_umeyama
-    from cohdc_train.trajectory.trajectory import read_tum
-
-    truth = read_tum(out / "sequence" / "groundtruth.txt")
+    truth = Trajectory.load_tum(out / "sequence" / "groundtruth.txt")
     path = truth.poses[:, :3, 3]
     axes.plot(path[:, 0], path[:, 1], color="0.4", linewidth=5, alpha=0.35, label="ground truth")
     for name, title in RUNS.items():
-        estimate = read_tum(out / "slam" / name / "trajectory.txt")
-        pairs = match(truth, estimate)
-        aligned = align_umeyama(pairs)
-        points = aligned[:, :3, 3]
+        estimate = Trajectory.load_tum(out / "slam" / name / "trajectory.txt")
+        matched_truth, matched = match(truth, estimate)
+        T = align_umeyama(matched.positions, matched_truth.positions)
+        points = _with_gaps(estimate.transformed(T))
         error = metrics[name]["ate_m"]["rmse"]
         label = f"{title}: error {100 * error:.1f} cm"
         axes.plot(points[:, 0], points[:, 1], color=COLORS[name], linewidth=1.6, label=label)
@@ -65,3 +66,9 @@ def _draw_trajectories(axes: "Axes", out: Path, metrics: dict[str, Any]) -> None
     axes.grid(alpha=0.25)
     axes.legend(loc="best", frameon=False)
     axes.set_title("Path of the camera from above")
+
+
+def _with_gaps(trajectory: Trajectory) -> FloatArray:
+    """Return the positions [n, 3] with a row of nan where tracking paused."""
+    pauses = np.flatnonzero(np.diff(trajectory.timestamps) > _LONGEST_GAP_S) + 1
+    return np.insert(trajectory.positions, pauses, np.nan, axis=0)

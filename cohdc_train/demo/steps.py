@@ -90,7 +90,7 @@ def export_model(out: Path) -> dict[str, Any]:
 
     for name in ("model.onnx", "model.onnx.json"):
         (out / name).unlink(missing_ok=True)
-    export(out / "train" / "best.ckpt", out / "model.onnx", out / "data" / "images")
+    export(out / "train" / "best.ckpt", out / "model.onnx", images=out / "data" / "images")
     return {}
 
 
@@ -117,11 +117,13 @@ def track(out: Path, name: str, seed: int) -> dict[str, Any]:
         seed: of the SLAM system.
     """
     from cohdc_train.slam.config import SlamConfig
-    from cohdc_train.slam.run import run_slam
+    from cohdc_train.slam.run import RunOptions, run_slam
 
     settings = SlamConfig(seed=seed).override(PLAIN if name == "plain" else {})
     model = out / "model.onnx" if name == "masks" else None
-    return run_slam(out / "sequence", out / "slam" / name, model=model, settings=settings)
+    options = RunOptions(animation=model is not None)
+    folder = out / "slam" / name
+    return run_slam(out / "sequence", folder, model=model, settings=settings, options=options)
 
 
 def _processes() -> ProcessPoolExecutor:

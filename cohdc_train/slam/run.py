@@ -13,12 +13,15 @@ from cohdc_train import __version__
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import SlamConfig, as_plain
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, no_masks
+from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import PoseCallback
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.growing_sequence import GrowingSequence
 from cohdc_train.slam.io.live import stop_on_sigint
 from cohdc_train.slam.io.results import (
+    ANIMATION,
+    DENSE_CLOUD,
     check_output_dir,
     compute_metrics,
     format_summary,
@@ -31,6 +34,7 @@ from cohdc_train.slam.runner import RunObserver, TrackedSequence, track_sequence
 from cohdc_train.slam.runtime.threads import single_threaded
 from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
 from cohdc_train.slam.system import Slam
+from cohdc_train.slam.visualization.animation import RunAnimation
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
 from cohdc_train.slam.visualization.worst_frames import WorstFrames
@@ -70,6 +74,7 @@ class RunOptions:
         realtime: take frames at the pace of their timestamps, and drop delayed ones; masks and
             mapping run in parallel with tracking. Results then depend on the machine.
         dense_cloud: write cloud.ply too, the dense colored points of all static surfaces.
+        animation: write animation.webp too: keypoints, dynamic mask, and trajectory side by side.
         follow: the sequence is still being written: take frames as its lists grow.
         idle_timeout: seconds without a new frame after which a followed sequence has ended; a file
             named done in its folder ends it, too.
@@ -80,6 +85,7 @@ class RunOptions:
     camera: Path | None = None
     realtime: bool = False
     dense_cloud: bool = False
+    animation: bool = False
     follow: bool = False
     idle_timeout: float = 10.0
     viewer: bool = False
@@ -88,6 +94,11 @@ class RunOptions:
     def __post_init__(self) -> None:
         if not 0 < self.idle_timeout < float("inf"):
             raise DataError(f"idle_timeout is {self.idle_timeout:g}; allowed: above 0")
+
+    def extra_files(self) -> list[str]:
+        """Return the names of the files that are written on request only."""
+        wanted = {DENSE_CLOUD: self.dense_cloud, ANIMATION: self.animation}
+        return [name for name, is_wanted in wanted.items() if is_wanted]
 
 
 def slam(
@@ -157,7 +168,7 @@ def run_slam(
     """
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
-    check_output_dir(out, options.dense_cloud)
+    check_output_dir(out, options.extra_files())
     sequence = source if isinstance(source, Path) else None
     if isinstance(source, Path):
         source = _open_folder(source, settings, options)
@@ -176,6 +187,7 @@ def run_slam(
             slam_system = _build_slam(source.camera, settings, workers)
             files = stack.enter_context(_map_files(source.camera, part, settings, options))
             worst_frames = WorstFrames()
+            animations = _animations(part, source.camera, settings, options)
             viewers = _open_viewer(stack, source.camera, files, options)
             stack.enter_context(stop_on_sigint(source))
             tracked = track_sequence(
@@ -183,11 +195,13 @@ def run_slam(
                 workers.source if workers else source,
                 workers.mask_of if workers else make_masks or no_masks,
                 part / "pictures",
-                [files, worst_frames, *observers, *viewers],
+                [files, worst_frames, *animations, *observers, *viewers],
                 workers.report_latency(on_pose) if workers else on_pose,
             )
             files.write(slam_system.map, tracked.trajectory)
             worst_frames.write(part / "pictures")
+            for animation in animations:
+                animation.write(tracked.trajectory, truth)
         metrics = _metrics(slam_system, tracked, workers, truth, source.num_unpaired)
         inputs = {"sequence": sequence, "model": model, "masks": masks}
         config = _config_text(inputs, source.camera, settings, options)
@@ -253,6 +267,15 @@ def _open_viewer(
         return []
     viewer = RerunViewer(camera, files.colors, options.viewer, options.rrd)
     return [stack.enter_context(viewer)]
+
+
+def _animations(
+    part: Path, camera: Camera, settings: SlamConfig, options: RunOptions
+) -> list[RunAnimation]:
+    """Return the observer that draws animation.webp; none where it is not wanted."""
+    if not options.animation:
+        return []
+    return [RunAnimation(part / ANIMATION, OrbExtractor(camera, settings.features))]
 
 
 def _metrics(

@@ -4,6 +4,7 @@ import csv
 import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from cohdc_train.trajectory.trajectory import Trajectory
 _VERB = "slam"
 _TEXT_FILES = ("trajectory.txt", "metrics.json", "frames.csv", "config.yaml")
 _NAMES = (*_TEXT_FILES, "map.ply", "map.png", "pictures")
-_DENSE_CLOUD = "cloud.ply"
+DENSE_CLOUD = "cloud.ply"
+ANIMATION = "animation.webp"
 _MIN_SCORED_FRAMES = 3  # fewer poses fix no rigid alignment
 _COLUMNS = (
     *("stamp", "tracked", "keyframe", "matches", "inliers", "culled_share"),
@@ -158,17 +160,17 @@ def move_into_place(part: Path, out: Path) -> None:
         print(f"{out / name}: {problem}; the file of this run is lost", file=sys.stderr)
 
 
-def check_output_dir(out: Path, is_dense: bool) -> None:
+def check_output_dir(out: Path, extras: Sequence[str] = ()) -> None:
     """Check that a folder can take the results of a run, and create the folder above it.
 
     Args:
         out: the folder.
-        is_dense: the run writes cloud.ply as well.
+        extras: files that the run writes as well.
 
     Raises:
         DataError: the folder cannot be written, or holds files of others with these names.
     """
-    check_folder(out, _VERB, [*_NAMES, _DENSE_CLOUD] if is_dense else _NAMES)
+    check_folder(out, _VERB, [*_NAMES, *extras])
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for folder in (out.parent, out):
