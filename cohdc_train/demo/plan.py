@@ -27,31 +27,31 @@ class DemoPlan:
 
 
 QUICK = DemoPlan(
-    train_images=48,
-    val_images=16,
+    train_images=40,
+    val_images=12,
     frames=180,
-    minutes=0.75,
+    minutes=0.6,
     expected_s={
-        "render": 35.0,
-        "shipped": 8.0,
-        "train": 60.0,
-        "export": 14.0,
-        "slam": 25.0,
-        "report": 6.0,
+        "render": 45.0,
+        "shipped": 7.0,
+        "train": 55.0,
+        "export": 15.0,
+        "slam": 30.0,
+        "report": 3.0,
     },
 )
 DEFAULT = DemoPlan(
-    train_images=120,
-    val_images=32,
+    train_images=96,
+    val_images=24,
     frames=180,
-    minutes=2.0,
+    minutes=1.75,
     expected_s={
         "render": 50.0,
-        "shipped": 12.0,
-        "train": 140.0,
-        "export": 14.0,
-        "slam": 25.0,
-        "report": 6.0,
+        "shipped": 9.0,
+        "train": 130.0,
+        "export": 15.0,
+        "slam": 30.0,
+        "report": 3.0,
     },
 )
 FULL = DemoPlan(
@@ -62,9 +62,9 @@ FULL = DemoPlan(
     expected_s={
         "render": 110.0,
         "shipped": 20.0,
-        "train": 630.0,
-        "export": 14.0,
-        "slam": 25.0,
-        "report": 6.0,
+        "train": 640.0,
+        "export": 15.0,
+        "slam": 30.0,
+        "report": 3.0,
     },
 )

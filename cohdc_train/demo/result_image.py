@@ -1,5 +1,6 @@
 """The demo's first image: a frame with mask and keypoints, and three trajectories."""
 
+import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LONGEST_GAP_S = 0.1  # a longer pause between two poses is left open
+_MOST_MASKED = 0.7  # share of the view
 COLORS = {"plain": "#c0392b", "geometry": "#d68910", "masks": "#1f77b4"}
 
 
@@ -38,13 +40,26 @@ def draw_result(out: Path, metrics: dict[str, Any]) -> None:
 
 
 def _draw_frame(axes: "Axes", out: Path) -> None:
-    """Show the stored frame in which the dynamic mask covers most."""
-    images = sorted((out / "slam" / "masks" / "pictures").glob("*_after.jpg"))
-    image = read_rgb(images[len(images) // 2])
+    """Show a tracked frame in which the dynamic mask covers much of the view."""
+    pictures = out / "slam" / "masks" / "pictures"
+    with (out / "slam" / "masks" / "frames.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    drawn = [row for row in rows if (pictures / f"{row['stamp']}_after.jpg").is_file()]
+    if not drawn:
+        return
+    best = max(drawn, key=_how_telling)
+    image = read_rgb(pictures / f"{best['stamp']}_after.jpg")
     if image is not None:
         axes.imshow(image)
-    axes.set_title("Dynamic mask of the fine-tuned network, and the keypoints that SLAM keeps")
+    axes.set_title("Dynamic mask (yellow) and the keypoints that SLAM keeps", fontsize=11)
     axes.axis("off")
+
+
+def _how_telling(row: dict[str, str]) -> float:
+    """Return the masked share of the view; less where tracking failed or nothing is left."""
+    masked = float(row["culled_share"])
+    is_useful = int(row["tracked"]) and masked < _MOST_MASKED
+    return masked if is_useful else masked - 1.0
 
 
 def _draw_trajectories(axes: "Axes", out: Path, metrics: dict[str, Any]) -> None:
@@ -64,8 +79,8 @@ def _draw_trajectories(axes: "Axes", out: Path, metrics: dict[str, Any]) -> None
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.grid(alpha=0.25)
-    axes.legend(loc="best", frameon=False)
-    axes.set_title("Path of the camera from above")
+    axes.legend(loc="upper left", frameon=False, fontsize=9)
+    axes.set_title("Path of the camera from above", fontsize=11)
 
 
 def _with_gaps(trajectory: Trajectory) -> FloatArray:

@@ -14,7 +14,9 @@ from cohdc_train.errors import CohdcError
 
 SHIPPED = "person"
 IMAGE_SIZE = (288, 384)  # px, of the rendered photographs
+CANVAS = (384, 512)  # px, of the fine-tuned network
 PERSON_DISTANCE = (0.5, 2.5)  # m, of the people in them
+_LEARNING_RATE = 3e-4
 PLAIN = {
     "free_space.enabled": False,
     "motion_segmentation.enabled": False,
@@ -72,8 +74,11 @@ def train(out: Path, plan: DemoPlan, seed: int) -> dict[str, float]:
     from cohdc_train.validation import validate
 
     shutil.rmtree(out / "train", ignore_errors=True)
+    # A low rate: the network knows people already, and the training is short.
     arguments = [
         f"--minutes={plan.minutes:g}",
+        f"--model.optimizer.lr={_LEARNING_RATE:g}",
+        f"--data.canvas=[{CANVAS[0]},{CANVAS[1]}]",
         f"--pretrained={SHIPPED}",
         f"--seed_everything={seed}",
         f"--out={out / 'train'}",
