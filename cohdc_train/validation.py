@@ -52,11 +52,11 @@ class ValidationOptions:
 
 
 def validate(
-    model: Path,
-    data: Path,
+    model: Path | str,
+    data: Path | str,
     *,
-    out: Path | None = None,
-    figures: Path | None = None,
+    out: Path | str | None = None,
+    figures: Path | str | None = None,
     **options: Any,
 ) -> dict[str, float]:
     """Score a model on the validation split of a COCO-format folder, and print the scores.
@@ -78,9 +78,11 @@ def validate(
     """
     settings = ValidationOptions(**options)
     keep_freed_memory()
+    out = None if out is None else Path(out)
+    figures = None if figures is None else Path(figures)
     if figures is not None:
         check_folder(figures, "validate", VALIDATION_FILES, "--figures")
-    results, split = _score(model_path(model), data, settings)
+    results, split = _score(model_path(model), Path(data), settings)
     for name, value in results.scores.items():
         print(f"{name:<24}{value:.4f}")
     if out is not None:
@@ -141,15 +143,15 @@ def common_split(root: Path, model: Path, class_names: Sequence[str]) -> CocoSpl
         class_names: classes of the ONNX file.
 
     Raises:
-        CohdcError: there is no such class, no object of them, or the folder cannot be used.
+        CohdcError: there is no such class.
+        DataError: an annotation or an image cannot be used.
     """
     whole = read_split("val", find_split(root, "val"))
     common = [name for name in whole.class_names if name in class_names]
     if not common:
         known = ", ".join(whole.class_names)
-        raise CohdcError(
-            f"{model}: none of its {len(class_names)} classes is one of {root}: {known}"
-        )
+        count = len(class_names)
+        raise CohdcError(f"{model}: none of its {count} classes is one of {root}: {known}")
     split = whole.with_classes(common)
     check_images(split)
     return split

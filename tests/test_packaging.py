@@ -103,6 +103,9 @@ def test_wheel_runs_outside_the_repository_without_torch(clean: Clean) -> None:
     assert Path(where).is_relative_to(clean.folder)
     assert torch == "None"
     assert "no problem found" in clean.run("cohdc", "env")
+    assert "{networks,tum,table3}" in clean.run("cohdc", "bench", "--help")
+    message = clean.run("cohdc", "bench", "tum", ".", "--out", "never", expect=1)
+    assert message == "cohdc bench: .: no folder with rgb.txt, depth.txt and groundtruth.txt\n"
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ class BlindSegmenter:
 
     class_names = ("car", "tree")
 
-    def __init__(self, model: Path, threads: int = 0) -> None:
+    def __init__(self, model: Path, num_threads: int = 0) -> None:
         """Take any file."""
 
     def __call__(self, rgb: np.ndarray) -> Detections:
@@ -45,7 +45,7 @@ def test_validation_of_onnx_reads_annotations_once(
     read_json = coco.read_json
     monkeypatch.setattr(coco, "read_json", lambda path: read_files.append(path) or read_json(path))
 
-    scores = validate(model, root, pictures=tmp_path / "figures")
+    scores = validate(model, root, figures=tmp_path / "figures")
 
     assert read_files == [root / "instances_val.json"]
     assert scores["segm_AP50"] == 0

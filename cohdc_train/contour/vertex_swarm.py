@@ -101,8 +101,8 @@ class VertexSwarm:
             if step != whisker:
                 left, right = f[1 : 1 + pairs], f[1 + pairs :]
                 best = np.minimum(left, right).argmin(0)
-                towards = b[best, index] * np.sign(left - right)[best, every][:, None]
-                moved = self._evaluator.snap_to_grid(self._x[index] - step * towards)[None]
+                direction = b[best, index] * np.sign(left - right)[best, every][:, None]
+                moved = self._evaluator.snap_to_grid(self._x[index] - step * direction)[None]
                 felt, f = np.concatenate([felt, moved]), np.concatenate([f, self._f(index, moved)])
             best = f.argmin(0)
             self._apart += int((f[best, every] - f[0]).sum())

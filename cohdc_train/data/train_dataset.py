@@ -117,19 +117,15 @@ class CocoTrainDataset(Dataset[tuple[Tensor, Target]]):
     def _target(self, scene: _Scene, image_id: int) -> Target:
         """Return the target: objects with a visible pixel, and crowd boxes with an area."""
         labels: list[int] = []
-        masks: list[Tensor] = [
-            torch.zeros((0, *(self.mini_mask or self.canvas)), dtype=torch.uint8)
-        ]
+        mask_size = self.mini_mask or self.canvas
+        masks = [torch.zeros((0, *mask_size), dtype=torch.uint8)]
         boxes = [torch.zeros((0, 4))]
         for label, mask in scene.objects:
             box = mask_boxes(mask[None])
-            if box[0, 2] > box[0, 0]:
+            is_visible = bool(box[0, 2] > box[0, 0])
+            if is_visible:
                 labels.append(label)
-                masks.append(
-                    mask[None]
-                    if self.mini_mask is None
-                    else _make_mini_mask(mask, box, self.mini_mask)
-                )
+                masks.append(self._kept_mask(mask, box))
                 boxes.append(box)
         ignore = scene.ignore
         target = {
@@ -141,6 +137,12 @@ class CocoTrainDataset(Dataset[tuple[Tensor, Target]]):
             "size": scene.size,
         }
         return target if self.mini_mask is None else target | {"frames": target["boxes"]}
+
+    def _kept_mask(self, mask: Tensor, box: Tensor) -> Tensor:
+        """Return a mask [H, W] as it is kept: [1, H, W] whole, or [1, h, w] on its box."""
+        if self.mini_mask is None:
+            return mask[None]
+        return _make_mini_mask(mask, box, self.mini_mask)
 
 
 def _occlude(

@@ -89,19 +89,15 @@ class Placement:
             augment: scales and probability of a flip.
         """
         jitter = float(torch.empty(()).uniform_(*augment.scale_jitter))
-        scale = min(c / n for n, c in zip(image, canvas, strict=True)) * jitter
-        rows, columns = (
-            max(1, min(n, round(c / scale))) for n, c in zip(image, canvas, strict=True)
-        )
-        size = [
-            max(1, min(c, round(n * scale))) for n, c in zip((rows, columns), canvas, strict=True)
-        ]
-        top, left = (
-            int(torch.randint(image[0] - rows + 1, ())),
-            int(torch.randint(image[1] - columns + 1, ())),
-        )
+        scale = min(canvas[0] / image[0], canvas[1] / image[1]) * jitter
+        rows = _round_within(canvas[0] / scale, image[0])
+        columns = _round_within(canvas[1] / scale, image[1])
+        height = _round_within(rows * scale, canvas[0])
+        width = _round_within(columns * scale, canvas[1])
+        top = int(torch.randint(image[0] - rows + 1, ()))
+        left = int(torch.randint(image[1] - columns + 1, ()))
         mirrored = bool(torch.rand(()) < augment.flip)
-        return cls(top, left, rows, columns, (size[0], size[1]), canvas, mirrored)
+        return cls(top, left, rows, columns, (height, width), canvas, mirrored)
 
     def image(self, pixels: Tensor) -> Tensor:
         """Place an image: uint8 [3, H, W] -> uint8 [3, *canvas]."""
@@ -132,6 +128,11 @@ class Placement:
     def _finish(self, content: Tensor) -> Tensor:
         flipped = content.flip(-1) if self.mirrored else content
         return F.pad(flipped, (0, self.canvas[1] - self.size[1], 0, self.canvas[0] - self.size[0]))
+
+
+def _round_within(value: float, largest: int) -> int:
+    """Return the nearest whole number in 1..largest."""
+    return max(1, min(largest, round(value)))
 
 
 def mask_boxes(masks: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ class ExportOptions:
             )
 
 
-def export(checkpoint: Path, out: Path | None = None, **options: Any) -> Path:
+def export(checkpoint: Path | str, out: Path | str | None = None, **options: Any) -> Path:
     """Write a checkpoint as an ONNX file, compared with the torch network before it is kept.
 
     The comparison runs batches of 1, 2 and 4 at three image sizes, a black image and one full of
@@ -66,4 +66,5 @@ def export(checkpoint: Path, out: Path | None = None, **options: Any) -> Path:
 
     from cohdc_train.exporter.steps import export_checkpoint
 
-    return export_checkpoint(checkpoint, out, settings)
+    target = None if out is None else Path(out)
+    return export_checkpoint(Path(checkpoint), target, settings)

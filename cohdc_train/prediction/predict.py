@@ -35,7 +35,9 @@ class SegmenterLike(Protocol):
         """Segment an image. rgb: uint8 [H, W, 3]."""
 
 
-def predict(source: Path, *, model: str | Path, out: Path, **options: Any) -> dict[str, Any]:
+def predict(
+    source: Path | str, *, model: Path | str, out: Path | str, **options: Any
+) -> dict[str, Any]:
     """Segment an image, a folder of images, a video or a webcam's images.
 
     Writes `<name>_overlay.jpg` per image (in overlays/ unless the format is coco) and the objects'
@@ -60,6 +62,7 @@ def predict(source: Path, *, model: str | Path, out: Path, **options: Any) -> di
         ContractError: the model cannot be used.
     """
     settings = PredictOptions(**options)
+    source, out = Path(source), Path(out)
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: is not a folder")
     images = read_images(source, settings.frames)

@@ -112,7 +112,7 @@ def _camera_pose(room: Room, rng: np.random.Generator) -> FloatArray:
         x, y = rng.uniform(-width / 2 + 0.3, width / 2 - 0.3), rng.uniform(0.3, length - 0.5)
         if room.is_free(x, y, 0.3):
             break
-    yaw = np.arctan2(0.0 - x, length * 0.55 - y) + rng.normal(0, 0.5)  # from +y towards +x
+    yaw = np.arctan2(0.0 - x, length * 0.55 - y) + rng.normal(0, 0.5)  # from +y toward +x
     angles = (yaw, rng.normal(-0.08, 0.12), rng.normal(0, 0.06))
     level = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     pose = np.eye(4)

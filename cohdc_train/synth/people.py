@@ -160,7 +160,7 @@ def _direction(swing: float, spread: float) -> Float32Array:
 
     Args:
         swing: forward of straight down, rad.
-        spread: towards y, rad, signed.
+        spread: toward y, rad, signed.
     """
     return np.array(
         [np.sin(swing) * np.cos(spread), np.sin(spread), -np.cos(swing) * np.cos(spread)],

@@ -41,7 +41,7 @@ class RoomBuilder:
         return self.add_texture(maker(self.rng, self.detail // 4, self.detail // 4))
 
     def add_shell(self, plain: bool = False) -> None:
-        """Add floor, ceiling and four walls with a texture each, darker towards the border.
+        """Add floor, ceiling and four walls with a texture each, darker toward the border.
 
         plain: walls of even paint, without a mark.
         """
@@ -209,7 +209,7 @@ class RoomBuilder:
 
 
 def _darken_border(image: Texture) -> Texture:
-    """Return a texture darkened towards its border, as walls are towards the corners of a room."""
+    """Return a texture darkened toward its border, as walls are toward the corners of a room."""
     height, width = image.shape[:2]
     x = np.minimum(np.arange(width), np.arange(width)[::-1]) / width
     y = np.minimum(np.arange(height), np.arange(height)[::-1]) / height

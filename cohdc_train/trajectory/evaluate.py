@@ -50,7 +50,10 @@ def coverage(groundtruth: Trajectory, estimate: Trajectory) -> float:
 
 
 def evaluate(
-    groundtruth: Path, estimate: Path, out: Path | None = None, max_difference: float = 0.02
+    groundtruth: Path | str,
+    estimate: Path | str,
+    out: Path | str | None = None,
+    max_difference: float = 0.02,
 ) -> dict[str, object]:
     """Score an estimated trajectory against ground truth; both are TUM text files.
 
@@ -81,7 +84,9 @@ def evaluate(
         print(f"{key:<16}" + "".join(f"{value:>10.4f}" for value in row.values()))
     print(f"pairs {pairs} of {len(guess)} estimated poses, coverage {100 * covered:.1f} %")
     if out is not None:
+        out = Path(out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        files = {"groundtruth": str(groundtruth.resolve()), "estimate": str(estimate.resolve())}
+        paths = {"groundtruth": groundtruth, "estimate": estimate}
+        files = {name: str(Path(path).resolve()) for name, path in paths.items()}
         write_json(out, {**result, **files})  # `cohdc report` draws what lies there
     return result

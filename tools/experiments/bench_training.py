@@ -9,8 +9,8 @@ order; ours has a CQE head, too. The reference does what torchvision's detection
 CocoDetection, polygons to masks, horizontal flip, resizing inside the model, SGD, float32; and
 validates by pasting masks, pycocotools' encoding and COCOeval of boxes and masks. Each side has a
 process of its own; blocks alternate, so that whatever else runs on the machine hits both.
-Validation needs a checkpoint, or detects next to nothing to paste: --checkpoint best.ckpt; the phase
-`file` validates its exported file instead: --onnx model.onnx.
+Validation needs a checkpoint, or detects next to nothing to paste: --checkpoint best.ckpt; the
+phase `file` validates its exported file instead: --onnx model.onnx.
 """
 
 import argparse

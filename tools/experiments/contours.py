@@ -5,8 +5,8 @@
         [--model FILE --photos FOLDER] [--count 300] [--seed 0]
 
 Sources: people that `cohdc synth` renders, the annotated objects of every COCO folder, and the
-masks that a model detects in a folder's images. `count` of each are drawn by the seed among those of
-at least 400 px. `dp` has one tolerance per source and floor, at which its mean IoU is that of
+masks that a model detects in a folder's images. `count` of each are drawn by the seed among those
+of at least 400 px. `dp` has one tolerance per source and floor, at which its mean IoU is that of
 bas_dp. Writes contours.json, contours.md and contours.png to DIR.
 """
 

@@ -181,7 +181,7 @@ def ellipse(cx: float, cy: float, rx: float, ry: float, theta: float = 0.0) -> l
         cy: center, px.
         rx: half axis along x, px.
         ry: half axis along y, px.
-        theta: angle by which it is turned from x towards y, rad.
+        theta: angle by which it is turned from x toward y, rad.
 
     Raises:
         ValueError: a half axis is not positive.
