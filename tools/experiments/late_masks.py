@@ -7,8 +7,8 @@
 Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done immediately, no
 frame is dropped, and the segmenter always takes --late frames: the same numbers on every machine.
 `--settings flow.enabled=false` matches every frame, as synchronous runs do. A few keypoints more or
-fewer show what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the means. Without
---model masks are those in the sequence's folder `masks`.
+fewer show what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the
+means. Without --model masks are those in the sequence's folder `masks`.
 """
 
 import argparse
