@@ -193,7 +193,7 @@ def select_on_grid(
 
 
 def _running_index(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number the elements of each group of sorted keys [n]: 0, 1, 2, ... from every new key."""
+    """Return the index of each element within its group of sorted keys [n]: 0, 1, 2, ..."""
     index = np.arange(len(groups))
     starts = np.r_[True, groups[1:] != groups[:-1]][: len(groups)]
     return np.asarray(index - np.maximum.accumulate(np.where(starts, index, 0)), dtype=np.int64)
