@@ -121,7 +121,7 @@ SLOW = pytest.mark.slow
 
 
 def people(folder: Path) -> None:
-    """Write a COCO-format folder with the one class of the shipped network, which keeps its heads."""
+    """Write a COCO-format folder whose one class keeps the heads of the shipped network."""
     coco_toys.folder(folder)
     for file in folder.glob("*.json"):
         content = json.loads(file.read_text())

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 # One person walks up to the camera and fills its view, another walks behind, the walls are bare:
-# less of the static room is visible than of moving people (docs/results/demo.md).
+# the people cover most of what could be tracked (docs/results/demo.md).
 SCENE_SEED = 1
 
 
