@@ -1,5 +1,10 @@
 """Fixtures: a small network whose random weights detect something."""
 
+import os
+
+# Before numpy and torch are loaded: the processes of pytest share the cores, one thread each.
+os.environ["OMP_NUM_THREADS"] = "1"
+
 import pytest
 import torch
 from hypothesis import settings
