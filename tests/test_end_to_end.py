@@ -43,7 +43,6 @@ def test_trained_network_is_exported_and_masks_frames_of_slam(tmp_path: Path) ->
     assert parity["detections_compared"] > 0
     assert parity["mask_iou_min"] >= 0.99
     metrics = json.loads((run / "metrics.json").read_text())
-    print(metrics)
     assert metrics["frames"] == FRAMES
     assert metrics["ms"]["segment"]["p50"] > 0
     estimate = Trajectory.load_tum(run / "trajectory.txt")
