@@ -5,11 +5,11 @@ What needs torch is imported by the fixtures: tests of the robot's rooms start w
 
 import os
 
-# Before numpy and torch are loaded: the processes of pytest share the cores, one thread each.
-os.environ["OMP_NUM_THREADS"] = "1"
+# Before numpy, OpenCV and torch are loaded: the processes share the cores, one thread each.
+os.environ["OMP_NUM_THREADS"] = os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +20,24 @@ settings.register_profile("patient", deadline=None)  # a busy machine is no fail
 settings.load_profile("patient")
 
 Once = Callable[[str, Callable[[Path], None]], Path]
+# Files of few tests that take long: they start first, so that no process waits at the end.
+LONGEST = ("test_demo.py", "test_end_to_end.py", "test_export.py", "test_fit.py", "test_docs.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first."""
+    place = {name: index for index, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_of_onnxruntime() -> Iterator[None]:
+    """Let a `Segmenter` that is asked for no number of threads use one."""
+    from cohdc_train.segmenter import Segmenter
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Segmenter.__init__, "__defaults__", (1,))
+        yield
 
 
 @pytest.fixture(scope="session")

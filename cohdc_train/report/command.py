@@ -28,7 +28,7 @@ _NAMED = 3  # runs that stand in a page's title
 
 
 class Kind(Enum):
-    """What wrote a folder or a file."""
+    """Command that wrote a folder or a file."""
 
     SLAM = "SLAM runs"
     TRAINING = "Trainings"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Quantity(NamedTuple):
-    """How a number is shown.
+    """Name, unit and digits with which a number is shown.
 
     name: without the unit; unit: empty for a share of 1 and for counts; digits: behind the point;
     better: +1 when larger is better, -1 when smaller is, 0 when neither.

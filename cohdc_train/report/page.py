@@ -34,6 +34,7 @@ class Table:
     note: str = ""
 
     def __post_init__(self) -> None:
+        """Check that every row has a cell for every word of the head."""
         if any(len(row) != len(self.head) for row in self.rows):
             raise ValueError(f"table {self.title!r}: not every row has {len(self.head)} cells")
 

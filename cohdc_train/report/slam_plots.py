@@ -38,7 +38,7 @@ _SHADES = (0.08, 0.9)  # part of the color map that is seen on white and on blac
 
 
 class StripScale(NamedTuple):
-    """What strips of several runs have in common, so that they can be compared.
+    """Scale that strips of several runs share, so that they can be compared.
 
     tops: row -> upper end of its axis; bins_per_inch: columns of a strip.
     """

@@ -37,6 +37,7 @@ class Frames:
     columns: Mapping[str, Floats]
 
     def __len__(self) -> int:
+        """Return the number of frames."""
         return len(self.timestamps)
 
     @property

@@ -88,7 +88,7 @@ class FrameResult:
 
     @property
     def union_mask(self) -> NDArray[np.bool_] | None:
-        """Given and dynamic mask together [H, W]: a static person is tracked, but is no furniture."""
+        """Given and dynamic mask together [H, W]; a static person belongs into no dense cloud."""
         if self.given_mask is None or self.dynamic_mask is None:
             return self.dynamic_mask
         return np.asarray(self.given_mask | self.dynamic_mask)

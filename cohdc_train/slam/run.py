@@ -13,23 +13,28 @@ from cohdc_train import __version__
 from cohdc_train.errors import DataError
 from cohdc_train.slam.config import SlamConfig, as_plain
 from cohdc_train.slam.dynamics.mask_sources import MaskFolder, SegmenterMasks, no_masks
+from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import PoseCallback
 from cohdc_train.slam.geometry.calibration import choose_camera
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.io.growing_sequence import GrowingSequence
 from cohdc_train.slam.io.live import stop_on_sigint
 from cohdc_train.slam.io.results import (
+    ANIMATION,
+    DENSE_CLOUD,
     check_output_dir,
     compute_metrics,
+    format_summary,
     move_into_place,
     write_run,
 )
 from cohdc_train.slam.io.sequence import choose_format
 from cohdc_train.slam.io.sources import FrameSource, RecordedSequence
-from cohdc_train.slam.runner import RunObserver, track_sequence
+from cohdc_train.slam.runner import RunObserver, TrackedSequence, track_sequence
 from cohdc_train.slam.runtime.threads import single_threaded
 from cohdc_train.slam.runtime.workers import RealtimeWorkers, start_workers
 from cohdc_train.slam.system import Slam
+from cohdc_train.slam.visualization.animation import RunAnimation
 from cohdc_train.slam.visualization.map_files import MapFiles
 from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
 from cohdc_train.slam.visualization.worst_frames import WorstFrames
@@ -69,6 +74,7 @@ class RunOptions:
         realtime: take frames at the pace of their timestamps, and drop delayed ones; masks and
             mapping run in parallel with tracking. Results then depend on the machine.
         dense_cloud: write cloud.ply too, the dense colored points of all static surfaces.
+        animation: write animation.webp too: keypoints, dynamic mask, and trajectory side by side.
         follow: the sequence is still being written: take frames as its lists grow.
         idle_timeout: seconds without a new frame after which a followed sequence has ended; a file
             named done in its folder ends it, too.
@@ -79,6 +85,7 @@ class RunOptions:
     camera: Path | None = None
     realtime: bool = False
     dense_cloud: bool = False
+    animation: bool = False
     follow: bool = False
     idle_timeout: float = 10.0
     viewer: bool = False
@@ -87,6 +94,11 @@ class RunOptions:
     def __post_init__(self) -> None:
         if not 0 < self.idle_timeout < float("inf"):
             raise DataError(f"idle_timeout is {self.idle_timeout:g}; allowed: above 0")
+
+    def extra_files(self) -> list[str]:
+        """Return the names of the files that are written on request only."""
+        wanted = {DENSE_CLOUD: self.dense_cloud, ANIMATION: self.animation}
+        return [name for name, is_wanted in wanted.items() if is_wanted]
 
 
 def slam(
@@ -156,7 +168,7 @@ def run_slam(
     """
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
-    check_output_dir(out, options.dense_cloud)
+    check_output_dir(out, options.extra_files())
     sequence = source if isinstance(source, Path) else None
     if isinstance(source, Path):
         source = _open_folder(source, settings, options)
@@ -170,74 +182,33 @@ def run_slam(
         with ExitStack() as stack:
             workers = None
             if options.realtime:
-                workers = stack.enter_context(
-                    start_workers(source, make_masks, settings.masks, settings.realtime)
-                )
+                parallel = start_workers(source, make_masks, settings.masks, settings.realtime)
+                workers = stack.enter_context(parallel)
             slam_system = _build_slam(source.camera, settings, workers)
             files = stack.enter_context(_map_files(source.camera, part, settings, options))
             worst_frames = WorstFrames()
-            watching: list[RunObserver] = [files, worst_frames, *observers]
-            if options.viewer or options.rrd is not None:
-                viewer = RerunViewer(source.camera, files.colors, options.viewer, options.rrd)
-                watching.append(stack.enter_context(viewer))
+            animations = _animations(part, source.camera, settings, options)
+            viewers = _open_viewer(stack, source.camera, files, options)
             stack.enter_context(stop_on_sigint(source))
             tracked = track_sequence(
                 slam_system,
                 workers.source if workers else source,
                 workers.mask_of if workers else make_masks or no_masks,
                 part / "pictures",
-                watching,
+                [files, worst_frames, *animations, *observers, *viewers],
                 workers.report_latency(on_pose) if workers else on_pose,
             )
             files.write(slam_system.map, tracked.trajectory)
             worst_frames.write(part / "pictures")
-        metrics: dict[str, Any] = {
-            "seed": settings.seed,
-            "realtime": options.realtime,
-            "loops": slam_system.num_loops,
-            "without_depth": source.num_unpaired,
-            "keyframes_in_map": len(slam_system.map.keyframes),
-        }
-        dropped = workers.source.dropped if workers else 0
-        metrics |= compute_metrics(tracked.records, tracked.trajectory, truth, dropped)
-        if workers is not None:
-            # Masks are propagated to each frame; the segmenter's own time is segmenter_ms.
-            stages = metrics["ms"].items()
-            metrics["ms"] = {"mask" if k == "segment" else k: v for k, v in stages}
-            metrics |= workers.metrics()
+            for animation in animations:
+                animation.write(tracked.trajectory, truth)
+        metrics = _metrics(slam_system, tracked, workers, truth, source.num_unpaired)
         inputs = {"sequence": sequence, "model": model, "masks": masks}
         config = _config_text(inputs, source.camera, settings, options)
         write_run(part, tracked.records, tracked.trajectory, metrics, config)
         move_into_place(part, out)
-    print(f"{summary(metrics)}\nwritten to {out}")
+    print(f"{format_summary(metrics)}\nwritten to {out}")
     return metrics
-
-
-def summary(metrics: dict[str, Any]) -> str:
-    """Return the small table at the end of a run."""
-    tracked = f"{metrics['tracked']} of {metrics['frames']} tracked"
-    in_map = f"{metrics['keyframes_in_map']} of them in the map at the end"
-    rows = [
-        ("frames", f"{tracked} ({100 * metrics['coverage']:.1f} %)"),
-        ("keyframes", f"{metrics['keyframes']}, {in_map}"),
-        ("loops closed", str(metrics["loops"])),
-        ("frames/s", f"{metrics['fps']:.1f}"),
-    ]
-    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
-    if metrics["realtime"]:
-        rows.append(("dropped", str(metrics["dropped"])))
-        names = {
-            "segmenter_ms": "segmenter ms",
-            "mask_age_ms": "mask age ms",
-            "latency_ms": "latency ms",
-        }
-        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
-    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
-    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
-        if key in metrics:
-            values = [f"{name} {value:.4f}" for name, value in metrics[key].items()]
-            rows.append((key, "  ".join(values)))
-    return "\n".join(f"  {name:<16}{text}" for name, text in rows)
 
 
 def _open_folder(folder: Path, settings: SlamConfig, options: RunOptions) -> FrameSource:
@@ -286,6 +257,50 @@ def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers |
         executor=workers.executor,
         frame_time_used=workers.source.frame_time_used,
     )
+
+
+def _open_viewer(
+    stack: ExitStack, camera: Camera, files: MapFiles, options: RunOptions
+) -> list[RunObserver]:
+    """Open the viewer where it is asked for."""
+    if not options.viewer and options.rrd is None:
+        return []
+    viewer = RerunViewer(camera, files.colors, options.viewer, options.rrd)
+    return [stack.enter_context(viewer)]
+
+
+def _animations(
+    part: Path, camera: Camera, settings: SlamConfig, options: RunOptions
+) -> list[RunAnimation]:
+    """Return the observer that draws animation.webp; none where it is not wanted."""
+    if not options.animation:
+        return []
+    return [RunAnimation(part / ANIMATION, OrbExtractor(camera, settings.features))]
+
+
+def _metrics(
+    slam_system: Slam,
+    tracked: TrackedSequence,
+    workers: RealtimeWorkers | None,
+    truth: Trajectory | None,
+    num_unpaired: int,
+) -> dict[str, Any]:
+    """Return the content of metrics.json."""
+    metrics: dict[str, Any] = {
+        "seed": slam_system.config.seed,
+        "realtime": workers is not None,
+        "loops": slam_system.num_loops,
+        "without_depth": num_unpaired,
+        "keyframes_in_map": len(slam_system.map.keyframes),
+    }
+    dropped = 0 if workers is None else workers.source.dropped
+    metrics |= compute_metrics(tracked.records, tracked.trajectory, truth, dropped)
+    if workers is not None:
+        # Masks are propagated to each frame; the segmenter's own time is segmenter_ms.
+        stages = metrics["ms"].items()
+        metrics["ms"] = {"mask" if name == "segment" else name: ms for name, ms in stages}
+        metrics |= workers.metrics()
+    return metrics
 
 
 def _config_text(

@@ -39,7 +39,7 @@ class RunObserver(Protocol):
 
 @dataclass(frozen=True)
 class _Figure:
-    """What is drawn of a frame when the run is over, so that no time of the run is used for it."""
+    """Content of a figure, which is drawn when the run is over."""
 
     frame: RGBDFrame
     mask: NDArray[np.bool_] | None

@@ -29,7 +29,8 @@ from cohdc_train.slam.tracking.frame_measurer import FrameMeasurer
 from cohdc_train.slam.tracking.keyframe_policy import KeyframePolicy
 from cohdc_train.slam.tracking.localizer import Localizer, LocalizerConfig
 from cohdc_train.slam.tracking.motion_model import MotionModel
-from cohdc_train.slam.tracking.tracker import Tracker, TrackerParts
+from cohdc_train.slam.tracking.tracker import Tracker
+from cohdc_train.slam.tracking.tracker_parts import TrackerParts
 from cohdc_train.trajectory.trajectory import Trajectory
 
 Mask = NDArray[np.bool_]

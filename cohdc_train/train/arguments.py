@@ -26,6 +26,7 @@ _NETWORK_NAMES = ("backbone", "depth")  # fields that say which network is meant
 _CONFIG_OPTIONS = ("--config", "-c")
 _RENAMED = {
     "pictures": "figures",
+    "data.cutouts": "data.paste_roots",
     "model.optimizer.frozen_steps": "model.optimizer.backbone_freeze_steps",
 }
 

@@ -94,7 +94,7 @@ def _board(seed: int) -> NDArray[np.uint8]:
 
 
 def camera_path(frames: int, later: float = 0.0) -> NDArray[np.float64]:
-    """[frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees, from `later` frames on."""
+    """Return [frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees."""
     s = (np.arange(frames) + later) / 60.0 * 2 * np.pi
     xi = np.stack([0.25 * np.sin(s), 0.1 * np.sin(2 * s), 0.12 * (1 - np.cos(s))], axis=1)
     turn = np.stack([0.04 * np.sin(s), 0.08 * (1 - np.cos(s)), 0.05 * np.sin(2 * s)], axis=1)

@@ -68,7 +68,7 @@ def overlap(mask: Mask, truth: Mask) -> tuple[float, float, float]:
 
 
 def measured(folder: Path, steps: list[int], every: int) -> list[dict[str, Any]]:
-    """A row for each of the steps. Raises DataError where no mask of anybody can be carried so far."""
+    """Return a row for each step. Raises DataError where no mask can be propagated that far."""
     frames, last = halves(folder), max(steps)
     starts = [start for start in range(0, len(frames) - last, every) if frames[start][1].any()]
     if not starts:

@@ -1,15 +1,14 @@
 #!/usr/bin/env python3
-"""What real time costs without a clock: masks that are late by so many frames, and optical flow
-between matched frames.
+"""Measure without a clock what real time costs: delayed masks, and optical flow between matches.
 
     tools/experiments/late_masks.py --sequences SEQUENCE ... --out OUT [--model person]
         [--late 0 3] [--features 1475 1500 1525]
 
-Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done at once, no frame
-is dropped, and the segmenter always takes --late frames: the same numbers on every machine.
-`--settings flow.enabled=false` matches every frame, as synchronous runs do. A few corners more or fewer show
-what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the means. Without
---model masks are those in the sequence's folder `masks`.
+Tracks TUM-format sequences as `cohdc slam --realtime` does, but mapping is done immediately, no
+frame is dropped, and the segmenter always takes --late frames: the same numbers on every machine.
+`--settings flow.enabled=false` matches every frame, as synchronous runs do. A few keypoints more or
+fewer show what is chance. OUT/late_masks.json has every run's ATE RMSE, OUT/late_masks.md the
+means. Without --model masks are those in the sequence's folder `masks`.
 """
 
 import argparse

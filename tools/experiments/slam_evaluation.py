@@ -177,8 +177,9 @@ def score(arguments: argparse.Namespace, name: str, mode: str, seed: int) -> Row
 
 
 def tables(rows: list[Row]) -> str:
-    """Return a table per choice of settings: ATE RMSE of every sequence and mode, median and worst over the seeds, and
-    coverage.
+    """Return a table per choice of settings: ATE RMSE of each sequence and mode.
+
+    Cells have the median and the worst over the seeds, and the coverage.
     """
     parts = []
     for settings in unique(json.dumps(row["settings"]) for row in rows):

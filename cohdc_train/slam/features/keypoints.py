@@ -50,10 +50,10 @@ class Keypoints:
 class Features:
     """Keypoints of one frame with undistorted positions and depth.
 
-    pixels: [n, 2] float64 as measured, px; undistorted: [n, 2] float64 px, as a pinhole camera would measure them; octaves: [n]
-    int64 pyramid level; descriptors: [n, 4] uint64 (256 bits); depths: [n] float64 m, nan where
-    there is no reading or it is refused; is_subpixel: [n] bool, refined by the patch of its point;
-    pyramid: the levels that octaves count.
+    pixels: [n, 2] float64 px, as measured; undistorted: [n, 2] float64 px, as a pinhole camera
+    would measure them; octaves: [n] int64 pyramid level; descriptors: [n, 4] uint64 (256 bits);
+    depths: [n] float64 m, nan where there is no reading or it is refused; is_subpixel: [n] bool,
+    refined by the patch of its point; pyramid: the levels that octaves count.
     """
 
     pixels: NDArray[np.float64]

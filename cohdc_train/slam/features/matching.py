@@ -1,4 +1,4 @@
-"""Finding the corners of a frame that belong to map points, by projection and descriptor."""
+"""Matching of map points with keypoints, by projection and descriptor."""
 
 from dataclasses import dataclass
 

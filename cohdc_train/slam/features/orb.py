@@ -1,6 +1,4 @@
-"""ORB corners spread over the image, only where nothing dynamic lies, with the depth readings that
-can be trusted.
-"""
+"""ORB keypoints spread over the image outside the dynamic mask, with reliable depth."""
 
 from collections.abc import Sequence
 from operator import attrgetter

@@ -1,4 +1,4 @@
-"""A rolling shutter: the rows of an image are read one after the other, while the camera moves on."""
+"""Correction of a rolling shutter, which reads an image row by row while the camera moves."""
 
 from dataclasses import replace
 
@@ -10,11 +10,10 @@ from cohdc_train.slam.geometry.se3 import Array
 
 
 def undo_rolling_shutter(features: Features, camera: Camera, twist: Array) -> Features:
-    """The corners as a camera would have measured them that takes all rows at once, halfway through
-    the readout.
+    """Return keypoints as a global shutter halfway through the readout would have measured them.
 
     twist: [6] velocity of the world in the camera's frame, (m/s, rad/s), a point moves by v + omega
-    x X. Corners without depth move as if at the median depth of the others.
+    x X. Keypoints without depth move as if at the median depth of the others.
     """
     depths = features.depths
     if camera.readout_s == 0 or np.isnan(depths).all():

@@ -4,6 +4,7 @@ import csv
 import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from cohdc_train.trajectory.trajectory import Trajectory
 _VERB = "slam"
 _TEXT_FILES = ("trajectory.txt", "metrics.json", "frames.csv", "config.yaml")
 _NAMES = (*_TEXT_FILES, "map.ply", "map.png", "pictures")
-_DENSE_CLOUD = "cloud.ply"
+DENSE_CLOUD = "cloud.ply"
+ANIMATION = "animation.webp"
 _MIN_SCORED_FRAMES = 3  # fewer poses fix no rigid alignment
 _COLUMNS = (
     *("stamp", "tracked", "keyframe", "matches", "inliers", "culled_share"),
@@ -121,6 +123,33 @@ def _row(record: FrameRecord) -> list[object]:
     ]
 
 
+def format_summary(metrics: dict[str, Any]) -> str:
+    """Return the small table at the end of a run."""
+    tracked = f"{metrics['tracked']} of {metrics['frames']} tracked"
+    in_map = f"{metrics['keyframes_in_map']} of them in the map at the end"
+    rows = [
+        ("frames", f"{tracked} ({100 * metrics['coverage']:.1f} %)"),
+        ("keyframes", f"{metrics['keyframes']}, {in_map}"),
+        ("loops closed", str(metrics["loops"])),
+        ("frames/s", f"{metrics['fps']:.1f}"),
+    ]
+    times = {f"{stage} ms": quantiles for stage, quantiles in metrics["ms"].items()}
+    if metrics["realtime"]:
+        rows.append(("dropped", str(metrics["dropped"])))
+        names = {
+            "segmenter_ms": "segmenter ms",
+            "mask_age_ms": "mask age ms",
+            "latency_ms": "latency ms",
+        }
+        times |= {text: metrics[key] for key, text in names.items() if key in metrics}
+    rows += [(name, f"p50 {q['p50']:.1f}  p95 {q['p95']:.1f}") for name, q in times.items()]
+    for key in ("ate_m", "rpe_1s_m", "rpe_1s_deg", "rpe_all_pairs_m"):
+        if key in metrics:
+            values = [f"{name} {value:.4f}" for name, value in metrics[key].items()]
+            rows.append((key, "  ".join(values)))
+    return "\n".join(f"  {name:<16}{text}" for name, text in rows)
+
+
 def move_into_place(part: Path, out: Path) -> None:
     """Move the files of a run into the output folder, in place of those of a former run.
 
@@ -131,17 +160,17 @@ def move_into_place(part: Path, out: Path) -> None:
         print(f"{out / name}: {problem}; the file of this run is lost", file=sys.stderr)
 
 
-def check_output_dir(out: Path, is_dense: bool) -> None:
+def check_output_dir(out: Path, extras: Sequence[str] = ()) -> None:
     """Check that a folder can take the results of a run, and create the folder above it.
 
     Args:
         out: the folder.
-        is_dense: the run writes cloud.ply as well.
+        extras: files that the run writes as well.
 
     Raises:
         DataError: the folder cannot be written, or holds files of others with these names.
     """
-    check_folder(out, _VERB, [*_NAMES, _DENSE_CLOUD] if is_dense else _NAMES)
+    check_folder(out, _VERB, [*_NAMES, *extras])
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for folder in (out.parent, out):

@@ -1,6 +1,4 @@
-"""Every tracked frame, by where it lies from a keyframe: keyframes move later on, and take it
-along.
-"""
+"""Poses of all tracked frames, relative to keyframes, which mapping may move later."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,9 +12,12 @@ from cohdc_train.slam.optimization.trajectory_smoothing import TrackedPoses
 
 
 class _Logged(NamedTuple):
-    """t: s; reference: index of the keyframe the frame hangs on; relative: [4, 4] T of the frame in
-    it, m; information: [6, 6] inverse covariance of the pose; prior_gradient: [6] gradient of what was
-    expected of it."""
+    """One frame.
+
+    timestamp: s; reference: index of its reference keyframe; relative: [4, 4] from that keyframe's
+    camera to the frame's, m; information: [6, 6] inverse covariance of the pose; prior_gradient:
+    [6] of the motion prior at the pose.
+    """
 
     timestamp: float
     reference: int
@@ -26,7 +27,7 @@ class _Logged(NamedTuple):
 
 
 class FrameHistory:
-    """The frames of one run, in their order."""
+    """Tracked frames of a run, in the order of time."""
 
     def __init__(self) -> None:
         self._frames: list[_Logged] = []

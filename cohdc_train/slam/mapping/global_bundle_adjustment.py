@@ -1,7 +1,7 @@
-"""The adjustment when a sequence is over: all keyframes, and what frames between them saw.
+"""Bundle adjustment of all keyframes when the sequence is over, with the frames between them.
 
-A keyframe every half second is what mapping has time for on the way. The frames between have seen
-every point ten times more often.
+Mapping has time for a keyframe every half second. The frames between observe each point ten times
+more often.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,8 +27,11 @@ from cohdc_train.slam.optimization.reprojection import Observations, Reprojectio
 
 
 class _Kept(NamedTuple):
-    """row: of the frame in the history; ids: [m] points that it saw; born: [m] keyframe index of each,
-    for a younger point may take the row of one that is gone; seen: the m measurements."""
+    """Observations of one frame.
+
+    row: of the frame in the history; ids: [m] map points; first_keyframe: [m] keyframe in which
+    each was created, for a younger point may take the row of a removed one; seen: measurements.
+    """
 
     row: int
     ids: NDArray[np.int64]
@@ -37,7 +40,7 @@ class _Kept(NamedTuple):
 
 
 class IntermediateFrames:
-    """Frames by what they saw of the map, evenly thinned: so many are kept that memory is bounded."""
+    """Observations of tracked frames, thinned evenly so that memory is bounded."""
 
     def __init__(self, config: BundleAdjustmentConfig, min_points: int) -> None:
         """Keep at most config.max_frames frames, of min_points points or more."""
@@ -81,11 +84,10 @@ class IntermediateFrames:
     def adjust(
         self, point_map: Map, reprojection: ReprojectionModel, history: FrameHistory
     ) -> None:
-        """Bundle-adjust the whole map by its keyframes, and then by these frames as well, which are
-        moved in the history; others stay where they lie from their reference keyframes.
+        """Bundle-adjust the map by its keyframes, then by these frames as well.
 
-        Without the first step a map that loops have moved is still too far off when the few of the
-        second are over.
+        The frames move in the history; others stay relative to their reference keyframes. The first
+        step brings a map that loop closure has moved close enough for the few steps of the second.
         """
         adjust_everything(point_map, reprojection, self._config)
         stamps, keyframes = (
@@ -102,7 +104,7 @@ class IntermediateFrames:
 
 
 def _frame_observations(kept: _Kept, T_cw: Array, point_map: Map) -> FrameObservations:
-    """What a frame saw of points that are still there."""
+    """Return a frame's observations of points that are still in the map."""
     same = np.flatnonzero(point_map.first_keyframe[kept.ids] == kept.first_keyframe)
     ids = point_map.resolve_merged(kept.ids[same])
     there = np.flatnonzero(point_map.num_observations[ids] > 0)
@@ -116,8 +118,10 @@ def adjust_everything(
     config: BundleAdjustmentConfig,
     observed: Sequence[FrameObservations] = (),
 ) -> Array:
-    """Bundle-adjust all keyframes and points at once, and what other frames saw of them; the first
-    keyframe holds still. Returns [s, 4, 4] T_cw of those frames, m."""
+    """Bundle-adjust all keyframes and points together, with the first keyframe fixed.
+
+    observed: observations of other frames. Returns the poses [s, 4, 4] T_cw of these frames, m.
+    """
     window = select_window(point_map, list(point_map.keyframes), 1, observed)
     poses = np.stack(window.poses)
     solution = solve(poses, window.points, window.problem, reprojection, config)

@@ -38,7 +38,7 @@ class Keyframe:
 
 
 def observations(features: Features, keypoints: NDArray[np.int64]) -> Observations:
-    """What a frame measured at some of its corners."""
+    """Return what a frame measured at some of its keypoints."""
     sigmas, depth_sigmas = features.sigmas[keypoints], features.scales[keypoints]
     return Observations(
         features.undistorted[keypoints], features.depths[keypoints], sigmas, depth_sigmas

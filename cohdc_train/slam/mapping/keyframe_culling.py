@@ -1,6 +1,4 @@
-"""Keyframes that show nothing the others do not show as well go, so that a map grows with the
-space, not with time.
-"""
+"""Culling of redundant keyframes, so that a map grows with the space, not with time."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +18,7 @@ def cull_keyframes(
     config: KeyframeCullingConfig,
     num_protected: int,
 ) -> list[Keyframe]:
-    """Remove redundant keyframes around the newest (ORB-SLAM's criterion), and points that too few
-    still observe.
+    """Remove redundant keyframes around the newest, and points that too few still observe.
 
     A keyframe is redundant when enough others observe nearly all of its points at the same scale, a
     finer or the next coarser one. The map's first keyframe stays, and the num_protected keyframes
@@ -47,7 +44,7 @@ def cull_keyframes(
 
 
 def _levels(ids: NDArray[np.int64], keyframes: list[Keyframe], size: int) -> NDArray[np.int8]:
-    """Return [keyframes, ids] at which pyramid level each keyframe observes each point, or _UNSEEN."""
+    """Return [keyframes, ids] the pyramid level of each observation, _UNSEEN without one."""
     column = np.full(size + 1, -1)
     column[ids] = np.arange(len(ids))
     levels = np.full((len(keyframes), len(ids)), _UNSEEN, dtype=np.int8)

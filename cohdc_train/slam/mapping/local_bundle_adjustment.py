@@ -1,7 +1,7 @@
-"""Bundle adjustment of keyframes, near the newest or all, in three steps: arrays out, the sums, the
-result back in.
+"""Bundle adjustment of the keyframes around the newest one.
 
-The middle step touches no map, so it may run elsewhere and later (`background_mapping`).
+Three steps: `build_window` copies arrays from the map, `solve` adjusts them, and `apply_solution`
+writes the result. The second step touches no map, so that another process may run it.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from cohdc_train.slam.optimization.reprojection import Observations, Reprojectio
 
 @dataclass(frozen=True)
 class Window:
-    """What a bundle adjustment starts from.
+    """Input of a bundle adjustment.
 
-    keyframes: [k] the newest last; poses: [c, 4, 4] T_cw, m, as they were, of the keyframes and
-    then of c - k other frames; ids: [p] map points; points: [p, 3] world, m, as they were; problem:
-    m measurements; corners: [m] the keyframe's corner behind each, or the other frame's row.
+    keyframes: [k] the newest last; poses: [c, 4, 4] T_cw, m, of the keyframes and then of c - k
+    other frames, before adjustment; ids: [p] map points; points: [p, 3] world, m, before
+    adjustment; problem: m measurements; keypoints: [m] row of each in its frame's keypoints.
     """
 
     keyframes: list[Keyframe]
@@ -37,9 +37,11 @@ class Window:
 
 @dataclass(frozen=True)
 class FrameObservations:
-    """What a frame that is no keyframe saw. T_cw: [4, 4] world to camera, m; ids: [m] map points,
-    none of them twice;
-    seen: the m measurements, as of points that surely stand still."""
+    """Observations of a frame that is no keyframe.
+
+    T_cw: [4, 4] world to camera, m; ids: [m] map points, each once; seen: the m measurements, with
+    the weight of static points.
+    """
 
     T_cw: Array
     ids: NDArray[np.int64]
@@ -48,7 +50,10 @@ class FrameObservations:
 
 @dataclass(frozen=True)
 class Solution:
-    """poses: [c, 4, 4] T_cw, m; points: [p, 3] world, m; good: [m] bool, measurements that fit."""
+    """Result of a bundle adjustment.
+
+    poses: [c, 4, 4] T_cw, m; points: [p, 3] world, m; good: [m] bool, True = inlier.
+    """
 
     poses: Array
     points: Array
@@ -113,13 +118,13 @@ def solve(
 
 
 def apply_solution(point_map: Map, window: Window, solution: Solution) -> Array | None:
-    """Put a solution into the map; measurements that do not fit are dropped.
+    """Write a solution into the map, and remove outlier measurements.
 
-    The map may have changed since the window was opened: what was added moves along with the
+    The map may have changed since the window was built: younger keyframes and points move with the
     window's newest keyframe. No keyframe of the window may have been removed.
-    Returns that motion, [4, 4]: a pose T_cw found since then becomes T_cw @ motion. None, and
-    nothing is done, when somebody else moved one of the keyframes in the meantime (a loop was
-    closed).
+
+    Returns that motion [4, 4]: a pose T_cw estimated since then becomes T_cw @ motion. Returns None
+    without a change where a loop closure has moved one of the keyframes meanwhile.
     """
     if any(k.T_cw is not before for k, before in zip(window.keyframes, window.poses, strict=False)):
         return None
@@ -131,9 +136,8 @@ def apply_solution(point_map: Map, window: Window, solution: Solution) -> Array 
             keyframe.T_cw = keyframe.T_cw @ motion
     added = np.flatnonzero(point_map.first_keyframe[: point_map.size] > newest)
     point_map.positions[added] = to_local(inverse(motion), point_map.positions[added])
-    same = (
-        point_map.first_keyframe[window.ids] <= newest
-    )  # a younger point may have taken the row of one that is gone
+    # A younger point may have taken the row of a removed one.
+    same = point_map.first_keyframe[window.ids] <= newest
     point_map.positions[window.ids[same]] = solution.points[same]
     for slot, member in enumerate(window.keyframes):
         member.T_cw = solution.poses[slot]

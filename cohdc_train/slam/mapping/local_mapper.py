@@ -1,4 +1,4 @@
-"""All that follows when a keyframe joins the map: at once, or a part per frame where time is short."""
+"""Insertion of keyframes, and the upkeep of the map after it."""
 
 from collections import deque
 from collections.abc import Callable

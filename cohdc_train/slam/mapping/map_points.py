@@ -1,6 +1,4 @@
-"""What a keyframe that joins brings: new points, duplicates merged, local bundle adjustment, weak
-points out.
-"""
+"""Creation, fusion, and culling of map points around a new keyframe."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +16,7 @@ def add_points(point_map: Map, keyframe: Keyframe, max_depth_m: float) -> None:
 
 
 def fuse(point_map: Map, keyframe: Keyframe) -> None:
-    """Look for the keyframe's points in its neighbours: more measurements; duplicates become the
-    older point.
-    """
+    """Search the keyframe's points in its neighbors; duplicates are fused into the older point."""
     ids = keyframe.observed_point_ids()
     neighbors = [
         k
@@ -35,17 +31,14 @@ def fuse(point_map: Map, keyframe: Keyframe) -> None:
 def fuse_into(
     point_map: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]
 ) -> None:
-    """Look for points in one keyframe that may not know them yet; `keyframes` are all that may hold
-    duplicates.
-    """
+    """Search points in another keyframe. keyframes: all that may observe duplicates."""
     _merge(point_map, _look_for(point_map, ids, other), keyframes)
 
 
 def _look_for(point_map: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np.int64]:
-    """Look for points in one keyframe, where they become measurements of corners that belong to
-    none.
+    """Search points in one keyframe, and match them with its free keypoints.
 
-    Returns [2, k] such points, and those that their corners belong to.
+    Returns [2, k] points whose keypoints belong to other points, and these.
     """
     config = point_map.config
     projected = point_map.project(point_map.unseen(ids, other), other.T_cw)
@@ -62,7 +55,7 @@ def _look_for(point_map: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArra
 
 
 def _merge(point_map: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
-    """Of pairs [2, k] of points that look alike, those that are near each other become one."""
+    """Fuse pairs [2, k] of points that look alike where they are close to each other."""
     distance = np.linalg.norm(point_map.positions[pairs[0]] - point_map.positions[pairs[1]], axis=1)
     first, second = pairs[:, distance < point_map.config.fuse_distance_m]
     if len(first) == 0:
@@ -79,9 +72,7 @@ def _merge(point_map: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) 
 
 
 def cull_map_points(point_map: Map, newest: int) -> None:
-    """Drop young points that few keyframes confirmed or that frames rarely found where they should
-    be.
-    """
+    """Remove young points that few keyframes observe, or that frames rarely match."""
     config = point_map.config
     oldest = newest - config.probation_keyframes
     is_young = point_map.first_keyframe[: point_map.size] >= oldest
@@ -94,7 +85,7 @@ def cull_map_points(point_map: Map, newest: int) -> None:
 
 
 def remove_points(point_map: Map, ids: NDArray[np.int64]) -> None:
-    """No keyframe sees these points any more."""
+    """Remove points from all keyframes that observe them."""
     drop = np.zeros(point_map.size + 1, dtype=np.bool_)
     drop[ids] = True
     for keyframe in point_map.observers_of(ids):

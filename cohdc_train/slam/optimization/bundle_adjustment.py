@@ -24,7 +24,7 @@ from cohdc_train.slam.optimization.reprojection import (
 
 @dataclass(frozen=True)
 class Problem:
-    """Which camera saw which point. No camera sees a point twice.
+    """Observations of points by cameras, no point twice by one camera.
 
     cameras: [m] int64 index into the poses, sorted; points: [m] int64 index into the points; seen:
     the m measurements;

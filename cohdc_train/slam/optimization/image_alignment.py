@@ -1,11 +1,11 @@
-"""Inverse compositional alignment of a local picture to the map's (paper section 2.3, equations 10
+"""Inverse compositional alignment of a local image to the map's (paper section 2.3, equations 10
 to 12).
 
 Where this departs from the paper:
-- its warp is a euclidean motion (x, y, theta) of whole map images. Pictures of a room have
+- its warp is a euclidean motion (x, y, theta) of whole map images. Images of a room have
   parallax, so that such a motion has no metric meaning; here the warp W(x; p) carries a pixel x of
-  the map's picture, through its measured depth, by a rigid motion p of six parameters into the
-  local picture;
+  the map's image, through its measured depth, by a rigid motion p of six parameters into the
+  local image;
 - equation 11 squares the residual and leaves out the transpose: misprints, for a squared residual
   has no sign. The step of Gauss-Newton is H^-1 times the sum of steepest-descent^T times the
   residual;
@@ -27,12 +27,12 @@ from cohdc_train.slam.optimization.reprojection import MIN_DEPTH_M
 
 @dataclass(frozen=True)
 class Alignment:
-    """How two pictures fit.
+    """Result of aligning two images.
 
-    T: [4, 4] camera of the map's picture to camera of the local one, m; before, after: mean clipped
-    photometric error, in standard deviations of the map's picture; correlation: -1..1 of the two
-    pictures where both see the same;
-    overlap: share of the map's pixels that the local picture sees at the depth they should have;
+    T: [4, 4] camera of the map's image to camera of the local one, m; before, after: mean clipped
+    photometric error, in standard deviations of the map's image; correlation: -1..1 of the two
+    images where both see the same;
+    overlap: share of the map's pixels that the local image sees at the depth they should have;
     agreement: the same share of those pixels that fall on a depth reading at all.
     """
 
@@ -47,14 +47,14 @@ class Alignment:
 def align(
     of_map: DepthImage, local: DepthImage, T: Array, config: LoopVerificationConfig
 ) -> Alignment | None:
-    """Refine T: [4, 4] camera of the map's picture to camera of the local one, m; coarse to fine.
+    """Refine T: [4, 4] camera of the map's image to camera of the local one, m; coarse to fine.
 
-    Returns None when the pictures hardly overlap or there is nothing to hold on to.
+    Returns None when the images hardly overlap or there is nothing to hold on to.
     """
     pairs = [(of_map, local)]
     for _ in range(config.levels - 1):
         pairs.append((pairs[-1][0].half(), pairs[-1][1].half()))
-    levels = [(_Template(picture, config), other) for picture, other in pairs]
+    levels = [(_Template(image, config), other) for image, other in pairs]
     start = _compare(*levels[0], T, config)
     refined = T
     for template, other in reversed(levels):
@@ -70,10 +70,10 @@ def align(
 
 
 class _Template:
-    """The map's picture, with the steepest-descent image of its usable pixels."""
+    """The map's image, with the steepest-descent image of its usable pixels."""
 
-    def __init__(self, picture: DepthImage, config: LoopVerificationConfig) -> None:
-        camera, depth = picture.camera, picture.depth
+    def __init__(self, image: DepthImage, config: LoopVerificationConfig) -> None:
+        camera, depth = image.camera, image.depth
         near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
         max_step = config.max_depth_step_ratio * depth
         usable: NDArray[np.bool_] = np.asarray((near > 0) & (far - near < max_step))
@@ -81,9 +81,9 @@ class _Template:
         rows, columns = np.nonzero(usable)
         pixels = np.stack([columns, rows], axis=1).astype(np.float64)
         self.points = camera.backproject(pixels, depth[rows, columns].astype(np.float64))
-        self.values = picture.gray[rows, columns].astype(np.float64)
+        self.values = image.gray[rows, columns].astype(np.float64)
         vertical, horizontal = (
-            np.gradient(picture.gray.astype(np.float64), axis=axis) for axis in (0, 1)
+            np.gradient(image.gray.astype(np.float64), axis=axis) for axis in (0, 1)
         )
         gradient = np.stack([horizontal, vertical], axis=-1)[rows, columns]
         self.descent = np.einsum("xi,xij->xj", gradient, warp_jacobian(self.points, camera))
@@ -115,7 +115,7 @@ def warp_jacobian(points: Array, camera: Camera) -> Array:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """A template in a local picture.
+    """A template in a local image.
 
     seen: [x] bool, which pixels both see; template, sampled: [s] their grey values in both, the
     latter with the gain and offset of the former; residual: [s] clipped; error, overlap, agreement:

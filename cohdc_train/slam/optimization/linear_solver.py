@@ -8,7 +8,10 @@ from cohdc_train.slam.geometry.se3 import Array
 
 
 def solve_symmetric(matrix: sparse.sparray | sparse.spmatrix, right: Array) -> Array:
-    """x of matrix @ x = right. matrix: sparse [n, n], symmetric and positive definite; right: [n]."""
+    """Solve matrix @ x = right for x [n].
+
+    matrix: sparse [n, n], symmetric and positive definite; right: [n].
+    """
     options = {"SymmetricMode": True}
     factors = splu(
         sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options

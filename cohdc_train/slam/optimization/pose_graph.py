@@ -69,8 +69,8 @@ def optimize_graph(poses: Array, edges: Edges, config: LoopConfig) -> tuple[Arra
     every other.
 
     poses: [n, 4, 4] T_cw. The Cauchy kernel of the robust edges begins so wide that each has at
-    least half its weight and narrows to config.cauchy_width, so that a right loop pulls from the start and a
-    wrong one lets go. Returns the poses and [e] the weight 0..1 each edge ended with.
+    least half its weight and narrows to config.cauchy_width, so that a right loop pulls from the
+    start and a wrong one lets go. Returns the poses and [e] the final weight 0..1 of each edge.
     """
     final = config.cauchy_width**2
     start = _squared(poses, edges)[edges.robust].max(initial=final)

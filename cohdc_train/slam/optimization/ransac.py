@@ -37,8 +37,8 @@ def ransac_pose(
     """The pose most matches agree with.
 
     points: [m, 3] world, m; seen: what the camera measured of them; guess: [4, 4] T_cw that
-    competes with the random hypotheses; hypotheses: in place of config.hypotheses. Returns T_cw and [m] bool, True = agrees; None with fewer
-    than three matches that have depth and no guess.
+    competes with the random hypotheses; hypotheses: in place of config.hypotheses. Returns T_cw and
+    [m] bool, True = agrees; None with fewer than three matches that have depth and no guess.
     """
     count = config.hypotheses if hypotheses is None else hypotheses
     poses = [] if guess is None else [guess[None]]

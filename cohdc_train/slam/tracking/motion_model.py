@@ -72,7 +72,7 @@ class MotionModel:
 
     @property
     def twist(self) -> Array | None:
-        """Velocity [6], (m/s, rad/s), or None while unknown: T_cw(t + dt) = exp(twist dt) T_cw(t)."""
+        """Velocity [6], (m/s, rad/s), None while unknown: T_cw(t + dt) = exp(twist dt) T_cw(t)."""
         state = self._state
         if state is None or not 0 < state.interval_s <= self._config.max_gap_s:
             return None
@@ -121,7 +121,7 @@ class MotionModel:
         interval_s: float,
         mean_nis: float,
     ) -> _State:
-        """Return the state at a pose of covariance [6, 6] `measured`, with a nearly unknown velocity."""
+        """Return the state at a pose with covariance `measured` [6, 6] and uncertain velocity."""
         covariance = np.diag(np.concatenate([np.zeros(6), self._unknown_velocity**2]))
         covariance[:6, :6] = measured
         return _State(timestamp, T_cw, velocity, covariance, interval_s, mean_nis)

@@ -1,63 +1,28 @@
 """Tracker: the pose of each frame, and the decision on keyframes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cohdc_train.slam.config import RealtimeConfig, TrackingConfig
-from cohdc_train.slam.dynamics.dynamic_mask import DynamicMaskEstimator
-from cohdc_train.slam.dynamics.free_space import FreeSpaceChecker
 from cohdc_train.slam.features.descriptors import thumbnail
 from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches
-from cohdc_train.slam.features.orb import OrbExtractor, gray_of
+from cohdc_train.slam.features.orb import gray_of
 from cohdc_train.slam.features.patch_alignment import Pyramid
 from cohdc_train.slam.frame import FrameResult, PoseCallback, RGBDFrame
 from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.depth_image import make_depth_image
 from cohdc_train.slam.geometry.se3 import inverse
-from cohdc_train.slam.mapping.frame_history import FrameHistory
-from cohdc_train.slam.mapping.global_bundle_adjustment import IntermediateFrames
 from cohdc_train.slam.mapping.keyframe import Keyframe
-from cohdc_train.slam.mapping.local_mapper import LocalMapper
-from cohdc_train.slam.mapping.map import Map
-from cohdc_train.slam.mapping.patch_refiner import PatchRefiner
-from cohdc_train.slam.tracking.flow_tracker import FlowTracker
-from cohdc_train.slam.tracking.frame_measurer import FrameMeasurer
-from cohdc_train.slam.tracking.keyframe_policy import KeyframePolicy
-from cohdc_train.slam.tracking.localizer import Localizer
-from cohdc_train.slam.tracking.motion_model import MotionModel, Prediction
-from cohdc_train.slam.tracking.pose_estimate import FrameFeatures, PoseEstimate
+from cohdc_train.slam.tracking.frame_matcher import FrameMatcher
+from cohdc_train.slam.tracking.motion_model import Prediction
+from cohdc_train.slam.tracking.pose_estimate import PoseEstimate
 from cohdc_train.slam.tracking.pose_reporter import PoseReporter
+from cohdc_train.slam.tracking.tracker_parts import TrackerParts
 from cohdc_train.slam.tracking.tracker_state import TrackerState
-
-Mask = NDArray[np.bool_]
-
-_FIRST_INFORMATION = 1e9  # of the first pose, which is the origin of the world
-
-
-@dataclass(frozen=True)
-class TrackerParts:
-    """Parts that a tracker works with; optional ones are None where they are switched off.
-
-    mapper: inserts keyframes; history, intermediate_frames: what tracked frames leave for the end.
-    """
-
-    point_map: Map
-    extractor: OrbExtractor
-    motion: MotionModel
-    measurer: FrameMeasurer
-    localizer: Localizer
-    keyframe_policy: KeyframePolicy
-    mapper: LocalMapper
-    free_space: FreeSpaceChecker
-    dynamic_mask: DynamicMaskEstimator | None
-    refiner: PatchRefiner | None
-    flow: FlowTracker | None
-    history: FrameHistory
-    intermediate_frames: IntermediateFrames | None
+from cohdc_train.types import Mask
 
 
 class Tracker:
@@ -80,7 +45,7 @@ class Tracker:
         self.map = parts.point_map
         self.parts = parts
         self.state = TrackerState()
-        self._config = config
+        self._matcher = FrameMatcher(parts, config)
         self._realtime = realtime
         self._frame_time_used = frame_time_used
 
@@ -114,7 +79,9 @@ class Tracker:
                 return report.result(flow_estimate)
 
         # Match the local map, or relocalize in all of it; on failure the flow estimate stands.
-        estimate, frame_features = self._track_in_map(frame, mask, prediction, flow_estimate)
+        estimate, frame_features = self._matcher.match(
+            frame, mask, state.last, prediction, flow_estimate
+        )
         report.publish(estimate or frame_features)
         if estimate is None:
             self._set_lost()
@@ -165,85 +132,6 @@ class Tracker:
         self._record(frame, estimate, refine=has_time)
         if has_time:
             self._apply_map_updates(self.parts.mapper.run_next_task)
-
-    def _track_in_map(
-        self,
-        frame: RGBDFrame,
-        mask: Mask | None,
-        prediction: Prediction | None,
-        flow_estimate: PoseEstimate | None,
-    ) -> tuple[PoseEstimate | None, FrameFeatures]:
-        """Return the pose by the map, else that by flow, else None; and the frame's keypoints."""
-        dynamic_mask = self._estimate_dynamic_mask(frame, mask, prediction)
-        refiner = self.parts.refiner
-        pyramid = None if refiner is None else refiner.pyramid(gray_of(frame.rgb))
-
-        extracted = FrameFeatures(self._extract(frame, dynamic_mask), dynamic_mask, pyramid)
-        estimate = self._match(frame, extracted, prediction, flow_estimate)
-
-        # The mask may cover all that the map knows: its points are static, so match them all.
-        if estimate is None and dynamic_mask is not None and self.map.keyframes:
-            extracted = replace(extracted, features=self._extract(frame, None))
-            estimate = self._match(frame, extracted, prediction, flow_estimate)
-            if estimate is not None:
-                estimate = replace(estimate, allows_keyframe=False)
-
-        if estimate is None and flow_estimate is not None:
-            return flow_estimate, flow_estimate.frame_features
-        return estimate, extracted
-
-    def _estimate_dynamic_mask(
-        self, frame: RGBDFrame, mask: Mask | None, prediction: Prediction | None
-    ) -> Mask | None:
-        """Return the mask without static objects, and with what depth shows to move."""
-        last = self.state.last
-        if self.parts.dynamic_mask is None or last is None or prediction is None:
-            return mask
-        around = self.map.covisible(last.matches.point_ids, self._config.local_keyframes)
-        T_cw = prediction.prior.T_cw
-        return self.parts.dynamic_mask.estimate(mask, frame.depth, T_cw, around, frame.timestamp)
-
-    def _extract(self, frame: RGBDFrame, mask: Mask | None) -> Features:
-        """Return the keypoints of a frame outside a mask, with depth."""
-        keypoints = self.parts.extractor.find(frame.rgb, mask)
-        return self.parts.measurer.measure(keypoints, frame, mask)
-
-    def _match(
-        self,
-        frame: RGBDFrame,
-        extracted: FrameFeatures,
-        prediction: Prediction | None,
-        flow_estimate: PoseEstimate | None,
-    ) -> PoseEstimate | None:
-        """Return the pose by the map, by refined keypoints or else by those extracted."""
-        if not self.map.keyframes:
-            return self._initialize(extracted)
-        localizer, last = self.parts.localizer, self.state.last
-        if last is None or prediction is None:
-            estimate = localizer.relocalize(extracted, frame.rgb)
-        else:
-            estimate = localizer.track_local_map(
-                extracted, frame.rgb, last, prediction, flow_estimate
-            )
-        if estimate is None:
-            return None
-        if self.parts.refiner is not None and extracted.pyramid is not None:
-            features = self.parts.refiner.refine(
-                extracted.features, estimate.matches, estimate.T_cw, extracted.pyramid
-            )
-            refined = localizer.refine_pose(replace(extracted, features=features), estimate)
-            if refined is not None or features is extracted.features:
-                return refined
-        return localizer.refine_pose(extracted, estimate)
-
-    def _initialize(self, extracted: FrameFeatures) -> PoseEstimate | None:
-        """Return the pose of a map's first frame, None where it has too few points."""
-        num_points = np.count_nonzero(~np.isnan(extracted.features.depths))
-        if num_points < self._config.min_points_to_initialize:
-            return None
-        none = np.zeros(0, dtype=np.int64)
-        information = _FIRST_INFORMATION * np.eye(6)
-        return PoseEstimate(np.eye(4), Matches(none, none), extracted, information=information)
 
     def _update_motion(self, frame: RGBDFrame, estimate: PoseEstimate) -> None:
         """Update the motion model with a frame's pose."""

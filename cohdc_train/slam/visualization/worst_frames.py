@@ -32,6 +32,7 @@ class WorstFrames:
     """Observer of a run that keeps the frames that were lost or had the fewest inliers."""
 
     def __init__(self) -> None:
+        """Start without a frame."""
         self._kept: list[_WeakFrame] = []
 
     def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:

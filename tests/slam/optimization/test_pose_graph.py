@@ -38,7 +38,7 @@ def square(per_side: int = 12, laps: int = 2, step: float = 0.5) -> Array:
 def graph(
     truth: Array, rng: np.random.Generator, loops: list[tuple[int, int]]
 ) -> tuple[Array, Edges]:
-    """Poses that drifted along noisy odometry, and its edges with those of the loops behind them."""
+    """Return poses that drifted along noisy odometry, and the edges of odometry and loops."""
     first = np.r_[np.arange(len(truth) - 1), [a for a, _ in loops]].astype(np.int64)
     second = np.r_[np.arange(1, len(truth)), [b for _, b in loops]].astype(np.int64)
     T = noisy(truth[second] @ inverse(truth[first]), rng)

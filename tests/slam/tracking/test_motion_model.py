@@ -1,4 +1,4 @@
-"""Where the camera is expected: the filter of its motion, and what an expectation does to a pose."""
+"""Motion model: prediction of the pose, and the prior that it gives."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,0 +1,159 @@
+"""Animated image of a run: keypoints, dynamic mask, and trajectory side by side."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from cohdc_train.drawing import fill_mask
+from cohdc_train.errors import DataError
+from cohdc_train.slam.features.orb import OrbExtractor
+from cohdc_train.slam.frame import FrameResult, RGBDFrame
+from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.visualization.overlays import draw_after, draw_before
+from cohdc_train.trajectory.association import match
+from cohdc_train.trajectory.metrics import align_umeyama
+from cohdc_train.trajectory.trajectory import Trajectory
+
+SUFFIXES = (".webp", ".gif")
+_PANEL = (240, 320)  # px, height and width of each of the three panels
+_MARGIN_PX = 18
+_RED, _BLUE, _GRAY = (230, 40, 40), (31, 119, 180), (150, 150, 150)  # RGB
+
+
+@dataclass(frozen=True)
+class _Panels:
+    """What is shown of one frame. keypoints, mask: [H, W, 3] RGB."""
+
+    timestamp: float
+    keypoints: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+
+
+class RunAnimation:
+    """Observer of a run that keeps every third frame for an animated image."""
+
+    def __init__(self, path: Path, extract: OrbExtractor, every: int = 3) -> None:
+        """Set what is kept.
+
+        Args:
+            path: animated image to write, .webp or .gif.
+            extract: searches keypoints in a whole image.
+            every: frames from one shown frame to the next.
+
+        Raises:
+            DataError: the suffix is of no animated image.
+        """
+        if path.suffix.lower() not in SUFFIXES:
+            raise DataError(f"{path}: an animation is a file {' or '.join(SUFFIXES)}")
+        self._path = path
+        self._extract = extract
+        self._every = every
+        self._num_seen = 0
+        self._shown: list[_Panels] = []
+
+    def __call__(self, frame: RGBDFrame, result: FrameResult, point_map: Map) -> None:
+        """Keep the panels of a frame if it is shown."""
+        self._num_seen += 1
+        if (self._num_seen - 1) % self._every:
+            return
+        dynamic = result.union_mask
+        found = self._extract(frame.rgb, frame.depth)
+        keypoints = draw_before(frame.rgb, found, dynamic)
+        self._shown.append(_Panels(frame.timestamp, _resize(keypoints), _draw_mask(frame, result)))
+
+    def write(self, trajectory: Trajectory, truth: Trajectory | None) -> None:
+        """Write the animated image.
+
+        Args:
+            trajectory: final poses of the run.
+            truth: ground truth, drawn in gray; the trajectory is aligned to it.
+        """
+        drawing = _TrajectoryPanel(trajectory, truth)
+        images = [
+            PillowImage.fromarray(
+                np.concatenate([shown.keypoints, shown.mask, drawing.draw(shown.timestamp)], axis=1)
+            )
+            for shown in self._shown
+        ]
+        first, *others = images
+        first.save(
+            self._path,
+            save_all=True,
+            append_images=others,
+            duration=100,
+            loop=0,
+            quality=55,
+            method=4,
+        )
+
+
+def _resize(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = _PANEL
+    resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(resized, np.uint8)
+
+
+def _draw_mask(frame: RGBDFrame, result: FrameResult) -> NDArray[np.uint8]:
+    """Draw the dynamic mask in red, and the keypoints that tracking used."""
+    image = frame.rgb.copy()
+    mask = result.union_mask
+    if mask is not None:
+        fill_mask(image, mask, _RED, 0.45)
+    if result.features is not None and mask is not None:
+        image = draw_after(image, result.features, mask)
+    elif result.features is not None:
+        image = draw_before(image, result.features, None)
+    return _resize(image)
+
+
+class _TrajectoryPanel:
+    """Camera path from above, up to a time."""
+
+    def __init__(self, trajectory: Trajectory, truth: Trajectory | None) -> None:
+        self._truth = truth
+        self._trajectory = trajectory if truth is None else _align(trajectory, truth)
+        shown = self._trajectory if truth is None else truth
+        positions = shown.positions[:, :2]
+        self._center = (positions.min(axis=0) + positions.max(axis=0)) / 2
+        extent = np.maximum(positions.max(axis=0) - positions.min(axis=0), 0.1)
+        height, width = _PANEL
+        sides = np.array([width, height]) - 2 * _MARGIN_PX
+        self._px_per_m = float((sides / extent).min()) / 1.25
+
+    def draw(self, timestamp: float) -> NDArray[np.uint8]:
+        """Draw the ground truth and the estimate until `timestamp`, s. Returns [H, W, 3] RGB."""
+        image = np.full((*_PANEL, 3), 255, np.uint8)
+        if self._truth is not None:
+            self._draw_path(image, self._truth.positions, _GRAY, 4)
+        known = self._trajectory.timestamps <= timestamp
+        self._draw_path(image, self._trajectory.positions[known], _BLUE, 2)
+        return image
+
+    def _draw_path(
+        self,
+        image: NDArray[np.uint8],
+        positions: NDArray[np.float64],
+        color: tuple[int, int, int],
+        thickness: int,
+    ) -> None:
+        height, width = _PANEL
+        offsets = (positions[:, :2] - self._center) * self._px_per_m
+        pixels = np.stack([width / 2 + offsets[:, 0], height / 2 - offsets[:, 1]], axis=1)
+        points = np.rint(pixels).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(image, [points], False, color, thickness, cv2.LINE_AA)
+        if len(points):
+            x, y = points[-1, 0].tolist()
+            cv2.circle(image, (x, y), thickness + 2, color, -1, cv2.LINE_AA)
+
+
+def _align(trajectory: Trajectory, truth: Trajectory) -> Trajectory:
+    """Align to the ground truth; too few common poses leave the trajectory as it is."""
+    try:
+        matched_truth, matched = match(truth, trajectory)
+    except DataError:
+        return trajectory
+    return trajectory.transformed(align_umeyama(matched.positions, matched_truth.positions))
