@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 # One person walks up to the camera and fills its view, another walks behind, the walls are bare:
-# what remains visible of the room is less than what moves (docs/results/demo.md).
+# the people cover most of what could be tracked (docs/results/demo.md).
 SCENE_SEED = 1
 
 

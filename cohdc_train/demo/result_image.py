@@ -41,14 +41,14 @@ def draw_result(out: Path, metrics: dict[str, Any]) -> None:
 
 def _draw_frame(axes: "Axes", out: Path) -> None:
     """Show a tracked frame in which the dynamic mask covers much of the view."""
-    pictures = out / "slam" / "masks" / "pictures"
+    figures = out / "slam" / "masks" / "pictures"
     with (out / "slam" / "masks" / "frames.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    drawn = [row for row in rows if (pictures / f"{row['stamp']}_after.jpg").is_file()]
+    drawn = [row for row in rows if (figures / f"{row['stamp']}_after.jpg").is_file()]
     if not drawn:
         return
     best = max(drawn, key=_how_telling)
-    image = read_rgb(pictures / f"{best['stamp']}_after.jpg")
+    image = read_rgb(figures / f"{best['stamp']}_after.jpg")
     if image is not None:
         axes.imshow(image)
     axes.set_title("Dynamic mask (yellow) and the keypoints that SLAM keeps", fontsize=11)

@@ -15,7 +15,7 @@ from cohdc_train.slam.io.sources import (
 from cohdc_train.slam.io.stereo import stereo_format
 
 
-def open_sequence(folder: Path, camera: Path | None = None) -> FrameSource:
+def open_sequence(folder: Path | str, camera: Path | str | None = None) -> FrameSource:
     """Open a recorded sequence in the format of the TUM RGB-D benchmark, or of a stereo pair.
 
     Args:
@@ -28,9 +28,10 @@ def open_sequence(folder: Path, camera: Path | None = None) -> FrameSource:
     Raises:
         DataError: the folder, its lists, or the camera cannot be used.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
-    intrinsics, _ = choose_camera(folder, camera)
+    intrinsics, _ = choose_camera(folder, None if camera is None else Path(camera))
     return RecordedSequence(folder, intrinsics, choose_format(folder, intrinsics))
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from cohdc_train.drawing import fill_mask
@@ -17,9 +16,11 @@ from cohdc_train.slam.visualization.overlays import draw_after, draw_before
 from cohdc_train.trajectory.association import match
 from cohdc_train.trajectory.metrics import align_umeyama
 from cohdc_train.trajectory.trajectory import Trajectory
+from cohdc_train.types import FloatArray, Image
 
 SUFFIXES = (".webp", ".gif")
 _PANEL = (240, 320)  # px, height and width of each of the three panels
+_TITLES = ("keypoints", "dynamic mask", "trajectory")
 _MARGIN_PX = 18
 _RED, _BLUE, _GRAY = (230, 40, 40), (31, 119, 180), (150, 150, 150)  # RGB
 
@@ -29,8 +30,8 @@ class _Panels:
     """What is shown of one frame. keypoints, mask: [H, W, 3] RGB."""
 
     timestamp: float
-    keypoints: NDArray[np.uint8]
-    mask: NDArray[np.uint8]
+    keypoints: Image
+    mask: Image
 
 
 class RunAnimation:
@@ -73,12 +74,12 @@ class RunAnimation:
             truth: ground truth, drawn in gray; the trajectory is aligned to it.
         """
         drawing = _TrajectoryPanel(trajectory, truth)
-        images = [
-            PillowImage.fromarray(
-                np.concatenate([shown.keypoints, shown.mask, drawing.draw(shown.timestamp)], axis=1)
-            )
-            for shown in self._shown
-        ]
+        images = []
+        for shown in self._shown:
+            panels = [shown.keypoints, shown.mask, drawing.draw(shown.timestamp)]
+            for panel, title in zip(panels, _TITLES, strict=True):
+                _write_title(panel, title)
+            images.append(PillowImage.fromarray(np.concatenate(panels, axis=1)))
         first, *others = images
         first.save(
             self._path,
@@ -91,13 +92,20 @@ class RunAnimation:
         )
 
 
-def _resize(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _write_title(panel: Image, title: str) -> None:
+    """Write the title of a panel in black on white, in place."""
+    cv2.rectangle(panel, (0, 0), (9 * len(title) + 8, 20), (255, 255, 255), -1)
+    place, font = (5, 15), cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(panel, title, place, font, 0.5, (30, 30, 30), 1, cv2.LINE_AA)
+
+
+def _resize(image: Image) -> Image:
     height, width = _PANEL
     resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(resized, np.uint8)
 
 
-def _draw_mask(frame: RGBDFrame, result: FrameResult) -> NDArray[np.uint8]:
+def _draw_mask(frame: RGBDFrame, result: FrameResult) -> Image:
     """Draw the dynamic mask in red, and the keypoints that tracking used."""
     image = frame.rgb.copy()
     mask = result.union_mask
@@ -124,7 +132,7 @@ class _TrajectoryPanel:
         sides = np.array([width, height]) - 2 * _MARGIN_PX
         self._px_per_m = float((sides / extent).min()) / 1.25
 
-    def draw(self, timestamp: float) -> NDArray[np.uint8]:
+    def draw(self, timestamp: float) -> Image:
         """Draw the ground truth and the estimate until `timestamp`, s. Returns [H, W, 3] RGB."""
         image = np.full((*_PANEL, 3), 255, np.uint8)
         if self._truth is not None:
@@ -135,8 +143,8 @@ class _TrajectoryPanel:
 
     def _draw_path(
         self,
-        image: NDArray[np.uint8],
-        positions: NDArray[np.float64],
+        image: Image,
+        positions: FloatArray,
         color: tuple[int, int, int],
         thickness: int,
     ) -> None:
