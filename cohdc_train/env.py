@@ -19,6 +19,7 @@ BASE = (
     "threadpoolctl",
     "matplotlib",
     "pillow",
+    "jinja2",
 )
 TRAIN = (
     "torch",

@@ -70,7 +70,7 @@ class Host(BaseHTTPRequestHandler):
 def host() -> Iterator[str]:
     Host.content, Host.breaks, Host.ranges, Host.asked = archive(FILES), None, True, []
     server = ThreadingHTTPServer(("127.0.0.1", 0), Host)
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
     thread.start()
     yield f"http://127.0.0.1:{server.server_address[1]}"
     server.shutdown()

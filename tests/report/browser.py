@@ -84,7 +84,7 @@ def browser_on(folder: Path) -> Iterator[Browser]:
     """Serve a folder's pages until the block ends."""
     handler = functools.partial(_Quiet, directory=str(folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
         thread.start()
         try:
             yield Browser(folder, f"http://127.0.0.1:{server.server_address[1]}")

@@ -115,6 +115,7 @@ def test_comparison_has_a_row_per_run_and_marks_the_best(tmp_path: Path, truth_f
     assert page.facts["Sequence"] == "room"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [10, 11])
 def test_page_of_many_runs_stays_small(tmp_path: Path, truth_file: Path, number: int) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)

@@ -102,6 +102,37 @@ def camera_path(frames: int, later: float = 0.0) -> NDArray[np.float64]:
     return exp_se3(np.concatenate([xi, turn], axis=1))
 
 
+@cache
+def _rays(camera: Camera) -> NDArray[np.float64]:
+    """Return the ray [H, W, 3] of each pixel, of depth 1."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
+    )
+
+
+def _covered_part(
+    origin: NDArray[np.float64],
+    across: NDArray[np.float64],
+    down: NDArray[np.float64],
+    camera: Camera,
+) -> tuple[slice, slice]:
+    """Return the rows and columns that a rectangle can cover; all where it reaches back."""
+    x, y, z = np.stack([origin, origin + across, origin + down, origin + across + down], axis=1)
+    if z.max() <= 0.1:
+        return slice(0, 0), slice(0, 0)
+    if z.min() <= 0.1:
+        return slice(0, camera.height), slice(0, camera.width)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return _pixels(v, camera.height), _pixels(u, camera.width)
+
+
+def _pixels(positions: NDArray[np.float64], size: int) -> slice:
+    """Return the pixels between the first and the last position that lie in an image."""
+    first, last = np.floor(positions.min()), np.ceil(positions.max())
+    return slice(int(np.clip(first, 0, size)), int(np.clip(last + 1, 0, size)))
+
+
 def render(
     rectangles: list[Rectangle], T_wc: NDArray[np.float64], camera: Camera = CAMERA
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
@@ -114,15 +145,13 @@ def render(
     rgb = np.full((camera.height, camera.width, 3), 90, dtype=np.uint8)
     nearest = np.full((camera.height, camera.width), np.inf)
     moving = np.zeros((camera.height, camera.width), dtype=np.bool_)
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
-    )
+    whole_image = _rays(camera)
     for item in rectangles:
         origin = T_cw[:3, :3] @ item.origin + T_cw[:3, 3]
         across, down = T_cw[:3, :3] @ item.across, T_cw[:3, :3] @ item.down
-        corners = (origin, origin + across, origin + down, origin + across + down)
-        if max(corner[2] for corner in corners) <= 0.1:
+        part = _covered_part(origin, across, down, camera)
+        rays = whole_image[part]
+        if rays.size == 0:
             continue
         normal = np.cross(across, down)
         depth = (normal @ origin) / (rays @ normal)
@@ -130,15 +159,12 @@ def render(
         a, b = local @ across / (across @ across), local @ down / (down @ down)
         height, width = item.texture.shape[:2]
         map_u, map_v = (a * width - 0.5).astype(np.float32), (b * height - 0.5).astype(np.float32)
-        is_visible = (a >= 0) & (a < 1) & (b >= 0) & (b < 1) & (depth > 0.1) & (depth < nearest)
+        seen = (a >= 0) & (a < 1) & (b >= 0) & (b < 1) & (depth > 0.1) & (depth < nearest[part])
         sampled = cv2.remap(
             item.texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        rgb[is_visible], nearest[is_visible], moving[is_visible] = (
-            sampled[is_visible],
-            depth[is_visible],
-            item.moving,
-        )
+        rgb[part][seen], nearest[part][seen] = sampled[seen], depth[seen]
+        moving[part][seen] = item.moving
     return rgb, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32), moving
 
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 import torch
+from toy_networks import with_statistics
 
 from cohdc_train.errors import CohdcError
 from cohdc_train.exporter.graph import write_graph
 from cohdc_train.exporter.quantization import quantize
 from cohdc_train.exporter.sample_images import draw_samples
 from cohdc_train.models import MaskRCNN, NetworkConfig, detect
-from cohdc_train.models.frozen_norm import FrozenNorm
 from cohdc_train.train.module import MaskRCNNModule
 
 pytestmark = pytest.mark.filterwarnings(
@@ -21,45 +21,42 @@ pytestmark = pytest.mark.filterwarnings(
 IMAGE = torch.from_numpy(draw_samples(1)[0]).permute(2, 0, 1)
 
 
-def trained(config: NetworkConfig) -> MaskRCNN:
-    """Return a network whose frozen norms do something."""
-    torch.manual_seed(0)
-    network = MaskRCNN(2, config).eval()
-    for module in network.modules():
-        if isinstance(module, FrozenNorm):
-            module.weight.uniform_(0.5, 1.5)
-            module.bias.normal_(std=0.2)
-            module.running_mean.normal_(std=0.2)
-            module.running_var.uniform_(0.5, 2)
-    with torch.no_grad():
-        network.rpn.head.cls_logits.weight.mul_(3)
-        network.rpn.head.bbox_pred.weight.mul_(10)
-    return network
-
-
 def module_of(config: NetworkConfig, names: list[str]) -> MaskRCNNModule:
     torch.manual_seed(1)
     return MaskRCNNModule(names, config).eval()
 
 
+Exported = tuple[MaskRCNN, Path]
+
+
 @pytest.fixture(
     scope="module", params=[pytest.param("resnet", marks=pytest.mark.slow), "mobilenet_v2"]
 )
-def network(request: pytest.FixtureRequest, opinionated: MaskRCNN) -> MaskRCNN:
-    options: dict[str, Any] = {"norm": "frozen", "backbone": request.param, "score_threshold": 0.05}
-    options |= (
-        {}
-        if request.param == "resnet"
-        else {"width": 1.0, "rates": ((1,), (1,), (1, 2), (1, 2, 3))}
-    )
-    return trained(dataclasses.replace(opinionated.config, **options))
+def exported(
+    request: pytest.FixtureRequest,
+    opinionated: MaskRCNN,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Exported:
+    """Return a network and the file that was exported from it."""
+    if request.param == "mobilenet_v2":
+        folder: Path = request.getfixturevalue("fine_tuned")
+        module = MaskRCNNModule.load(folder / "training" / "best.ckpt")
+        return module.network.eval(), folder / "model.onnx"
+    options: dict[str, Any] = {"norm": "frozen", "backbone": "resnet", "score_threshold": 0.05}
+    network = with_statistics(dataclasses.replace(opinionated.config, **options))
+    path = tmp_path_factory.mktemp("exported") / "model.onnx"
+    write_graph(network, ["person", "car"], path)
+    return network, path
 
 
 @pytest.fixture(scope="module")
-def file(network: MaskRCNN, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("exported") / "model.onnx"
-    write_graph(network, ["person", "car"], path)
-    return path
+def network(exported: Exported) -> MaskRCNN:
+    return exported[0]
+
+
+@pytest.fixture(scope="module")
+def file(exported: Exported) -> Path:
+    return exported[1]
 
 
 def test_loaded_network_detects_what_the_file_detects(network: MaskRCNN, file: Path) -> None:
