@@ -2,11 +2,10 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from toy_networks import with_statistics
+from toy_networks import MOBILENET, SMALL, with_statistics
 
 from cohdc_train.errors import CohdcError
 from cohdc_train.exporter.graph import write_graph
@@ -27,23 +26,21 @@ def module_of(config: NetworkConfig, names: list[str]) -> MaskRCNNModule:
 
 
 Exported = tuple[MaskRCNN, Path]
+RESNET = dataclasses.replace(SMALL, norm="frozen", score_threshold=0.05)
+UNTRAINED = {"resnet": RESNET, "mobilenet_v2": MOBILENET}
 
 
 @pytest.fixture(
-    scope="module", params=[pytest.param("resnet", marks=pytest.mark.slow), "mobilenet_v2"]
+    scope="module",
+    params=[*(pytest.param(name, marks=pytest.mark.slow) for name in UNTRAINED), "fine_tuned"],
 )
-def exported(
-    request: pytest.FixtureRequest,
-    opinionated: MaskRCNN,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Exported:
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """Return a network and the file that was exported from it."""
-    if request.param == "mobilenet_v2":
+    if request.param == "fine_tuned":
         folder: Path = request.getfixturevalue("fine_tuned")
         module = MaskRCNNModule.load(folder / "training" / "best.ckpt")
         return module.network.eval(), folder / "model.onnx"
-    options: dict[str, Any] = {"norm": "frozen", "backbone": "resnet", "score_threshold": 0.05}
-    network = with_statistics(dataclasses.replace(opinionated.config, **options))
+    network = with_statistics(UNTRAINED[request.param])
     path = tmp_path_factory.mktemp("exported") / "model.onnx"
     write_graph(network, ["person", "car"], path)
     return network, path
@@ -69,6 +66,7 @@ def test_loaded_network_detects_what_the_file_detects(network: MaskRCNN, file: P
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("exported", UNTRAINED, indirect=True)  # whose biases are 0
 def test_quantized_weights_load_within_their_step(
     network: MaskRCNN, file: Path, tmp_path: Path
 ) -> None:
