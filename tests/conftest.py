@@ -58,7 +58,7 @@ def small_config():
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
-    """Fill a folder once for all processes of a test run: once(name, fill) returns it."""
+    """Return a function that fills a folder once for all processes of a test run."""
     root = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent  # each process has a folder of its own in that of the test run

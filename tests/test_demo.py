@@ -53,7 +53,8 @@ def test_each_step_leaves_its_files(finished: Path) -> None:
         "model.onnx.json",
         "slam/plain/trajectory.txt",
         "slam/geometry/metrics.json",
-        "slam/masks/animation.webp",
+        "slam/masks/metrics.json",
+        "demo.webp",
         "result.png",
         "report.html",
     ]

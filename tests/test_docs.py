@@ -121,7 +121,7 @@ SLOW = pytest.mark.slow
 
 
 def people(folder: Path) -> None:
-    """A COCO-format folder with the shipped network's one class, so that its heads are kept."""
+    """Write a COCO-format folder whose one class keeps the heads of the shipped network."""
     coco_toys.folder(folder)
     for file in folder.glob("*.json"):
         content = json.loads(file.read_text())
@@ -132,7 +132,7 @@ def people(folder: Path) -> None:
 
 
 def photographs(folder: Path) -> None:
-    """The same images and people as labelme files."""
+    """Write the same images and people as labelme files."""
     people(folder)
     for file in list(folder.glob("instances_*.json")):
         content = json.loads(file.read_text())

@@ -224,7 +224,6 @@ def test_export_replaces_its_own_file(checkpoint, written, tmp_path):
 
 def test_a_file_that_differs_is_not_left_behind(checkpoint, written, tmp_path, monkeypatch):
     """The export fails with a tolerance below rounding, and leaves no file."""
-
     monkeypatch.setitem(parity.TOLERANCES, "masks", 0.0)
     with pytest.raises(ExportError, match=r"m\.onnx: masks differ from torch by"):
         export(checkpoint, tmp_path / "m.onnx")

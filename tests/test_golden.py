@@ -50,8 +50,8 @@ def test_times_versions_logs_and_configs_are_ignored(compare: ModuleType, folder
     assert comparison.digest == compare.compare_folders(folders[1], folders[0]).digest
 
 
-def test_drawn_pictures_count_only_on_request(compare: ModuleType, folders: Folders) -> None:
-    comparison = compare.compare_folders(*folders, with_pictures=True)
+def test_drawn_images_are_compared_only_on_request(compare: ModuleType, folders: Folders) -> None:
+    comparison = compare.compare_folders(*folders, with_images=True)
     assert comparison.different == ["out/pictures/1.0_after.jpg"]
 
 

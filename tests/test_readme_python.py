@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def test_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
-    write_sequence(tmp_path / "walk", 4)
+    write_sequence(tmp_path / "recording", 4)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     exec(example, names)

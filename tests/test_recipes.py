@@ -121,7 +121,7 @@ def test_converter_of_the_recipe_converts(tmp_path: Path) -> None:
 
 
 def write_detector(path: Path) -> None:
-    """A file of the recipe's layout that always reports one box."""
+    """Write a model with the recipe's outputs that always reports one box."""
     tensors = {
         "boxes": np.array([[16, 16, 48, 48], [0, 0, 9, 9]], np.float32),
         "scores": np.array([0.9, 0.01], np.float32),

@@ -19,9 +19,9 @@ def demo(
 
     Renders photographs of people and an RGB-D sequence in which a person fills the view, scores
     the shipped network, fine-tunes it, exports it, and tracks the sequence in three ways: plain
-    RGB-D SLAM, with depth geometry, with masks and geometry. Writes result.png, report.html,
-    summary.json, model.onnx, data/, sequence/, train/, and slam/. Nothing is downloaded. A second
-    call with the same options keeps the steps that are done.
+    RGB-D SLAM, with depth geometry, with masks and geometry. Writes result.png, demo.webp,
+    report.html, summary.json, model.onnx, data/, sequence/, train/, and slam/. Nothing is
+    downloaded. A second call with the same options keeps the steps that are done.
 
     Args:
         out: new or empty folder, or the folder of a former demo.

@@ -12,7 +12,15 @@ from cohdc_train.files import check_folder, files_below, list_files, remove_list
 VERB = "demo"
 STATE = "demo.json"  # written first, so that a later call knows the folder as its own
 FOLDERS = ("data", "sequence", "train", "slam")
-FILES = (STATE, "model.onnx", "model.onnx.json", "result.png", "report.html", "summary.json")
+FILES = (
+    STATE,
+    "model.onnx",
+    "model.onnx.json",
+    "result.png",
+    "demo.webp",
+    "report.html",
+    "summary.json",
+)
 
 Result = dict[str, Any]
 

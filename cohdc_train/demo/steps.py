@@ -122,13 +122,27 @@ def track(out: Path, name: str, seed: int) -> dict[str, Any]:
         seed: of the SLAM system.
     """
     from cohdc_train.slam.config import SlamConfig
-    from cohdc_train.slam.run import RunOptions, run_slam
+    from cohdc_train.slam.features.orb import OrbExtractor
+    from cohdc_train.slam.geometry.calibration import load_camera
+    from cohdc_train.slam.run import run_slam
+    from cohdc_train.slam.visualization.animation import RunAnimation
+    from cohdc_train.trajectory.trajectory import Trajectory
 
     settings = SlamConfig(seed=seed).override(PLAIN if name == "plain" else {})
     model = out / "model.onnx" if name == "masks" else None
-    options = RunOptions(animation=model is not None)
-    folder = out / "slam" / name
-    return run_slam(out / "sequence", folder, model=model, settings=settings, options=options)
+    sequence, folder = out / "sequence", out / "slam" / name
+    if model is None:
+        return run_slam(sequence, folder, settings=settings)
+
+    camera = load_camera(sequence / "camera.yaml")
+    animation = RunAnimation(out / "demo.webp", OrbExtractor(camera, settings.features))
+    metrics = run_slam(sequence, folder, model=model, settings=settings, observers=[animation])
+    animation.write(
+        Trajectory.load_tum(folder / "trajectory.txt"),
+        Trajectory.load_tum(sequence / "groundtruth.txt"),
+        baseline=Trajectory.load_tum(out / "slam" / "plain" / "trajectory.txt"),
+    )
+    return metrics
 
 
 def _processes() -> ProcessPoolExecutor:

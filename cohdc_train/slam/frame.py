@@ -1,4 +1,4 @@
-"""A frame, and the result of tracking it."""
+"""RGB-D frame, and the result of tracking it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ PoseSource = Literal["map", "flow"]
 
 @dataclass(frozen=True)
 class RGBDFrame:
-    """Color image and depth image of one moment.
+    """Color image and depth image with one timestamp.
 
     Args:
         timestamp: s.
@@ -63,10 +63,11 @@ class FrameResult:
     """Result of tracking one frame.
 
     timestamp: s; T_wc: [4, 4] camera to world, m, None unless tracked; status: "initializing" until
-    the first keyframe, then "tracking" or "lost"; source: what the pose was found by, the map or
-    optical flow; num_matches: map points that the frame is matched with; num_inliers: those that
-    agree with the pose; features: keypoints; dynamic_mask: [H, W] bool, what tracking did not use:
-    the given mask without static objects, and what depth showed to move; given_mask: [H, W] bool.
+    the first keyframe, then "tracking" or "lost"; source: "map" or "flow", which the pose was
+    estimated by; num_matches: map points that the frame is matched with; num_inliers: matches that
+    agree with the pose; features: keypoints; dynamic_mask: [H, W] bool, pixels that tracking did
+    not use: the given mask without static objects, and moving objects detected by depth;
+    given_mask: [H, W] bool.
     """
 
     timestamp: float
@@ -83,12 +84,15 @@ class FrameResult:
 
     @property
     def is_tracked(self) -> bool:
-        """Whether the frame has a pose."""
+        """Return whether the frame has a pose."""
         return self.T_wc is not None
 
     @property
     def union_mask(self) -> NDArray[np.bool_] | None:
-        """Given and dynamic mask together [H, W]; a static person belongs into no dense cloud."""
+        """Return the union [H, W] of the given and the dynamic mask, for the dense cloud.
+
+        A static person is not part of the dense cloud either.
+        """
         if self.given_mask is None or self.dynamic_mask is None:
             return self.dynamic_mask
         return np.asarray(self.given_mask | self.dynamic_mask)
@@ -99,7 +103,10 @@ PoseCallback = Callable[[FrameResult], None]
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """Row of frames.csv. masked_ratio: share of the pixels under the dynamic mask."""
+    """Row of frames.csv.
+
+    masked_ratio: share of the pixels under the dynamic mask.
+    """
 
     timestamp_text: str
     is_tracked: bool

@@ -1,4 +1,4 @@
-"""`cohdc slam` and `run_slam`: a sequence or a camera in, a trajectory and its scores out."""
+"""Run of a sequence or a camera through SLAM: `cohdc slam` and `run_slam`."""
 
 import tempfile
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ from cohdc_train.slam.visualization.rerun_viewer import RerunViewer
 from cohdc_train.slam.visualization.worst_frames import WorstFrames
 from cohdc_train.trajectory.trajectory import Trajectory
 
-# Options of earlier versions: `cohdc slam` tells their names of today.
+# Options of earlier versions, for which `cohdc slam` prints the current name.
 RENAMED_OPTIONS = {
     "--sequence": "the first argument, cohdc slam SEQUENCE,",
     "--seed": "--settings.seed",
@@ -67,10 +67,11 @@ RENAMED_OPTIONS = {
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a run, beside its input and the settings of the SLAM system.
+    """Options of a run, in addition to its input and the settings of the SLAM system.
 
     Args:
-        camera: camera YAML; else camera.yaml of the sequence, else a guess from the folder's name.
+        camera: camera YAML; by default camera.yaml of the sequence, or a guess from the folder's
+            name.
         realtime: take frames at the pace of their timestamps, and drop delayed ones; masks and
             mapping run in parallel with tracking. Results then depend on the machine.
         dense_cloud: write cloud.ply too, the dense colored points of all static surfaces.
@@ -164,7 +165,7 @@ def run_slam(
         on_pose: called with each frame's result as soon as its pose is known.
 
     Raises:
-        DataError: the input cannot be used, or no frame comes; one line that names file and number.
+        DataError: the input cannot be used, or has no frames.
     """
     if model is not None and masks is not None:
         raise DataError("give --model or --masks, not both")
@@ -212,7 +213,7 @@ def run_slam(
 
 
 def _open_folder(folder: Path, settings: SlamConfig, options: RunOptions) -> FrameSource:
-    """Open the folder of a sequence, and say what is read."""
+    """Open the folder of a sequence, and print what is read."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
     camera, origin = choose_camera(folder, options.camera)
@@ -242,13 +243,13 @@ def _mask_source(
 
 
 def _map_files(camera: Camera, folder: Path, settings: SlamConfig, options: RunOptions) -> MapFiles:
-    """Return the recorder of the map's files."""
+    """Return the writer of the map's files."""
     max_depth_m = settings.depth.limit_m(camera.baseline)
     return MapFiles(camera, folder, options.dense_cloud, max_depth_m, settings.dense_cloud)
 
 
 def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers | None) -> Slam:
-    """Build the SLAM system, in real time with the workers."""
+    """Build the SLAM system, with the workers in real time."""
     if workers is None:
         return Slam(camera, settings)
     return Slam(
@@ -262,7 +263,7 @@ def _build_slam(camera: Camera, settings: SlamConfig, workers: RealtimeWorkers |
 def _open_viewer(
     stack: ExitStack, camera: Camera, files: MapFiles, options: RunOptions
 ) -> list[RunObserver]:
-    """Open the viewer where it is asked for."""
+    """Open the viewer if requested."""
     if not options.viewer and options.rrd is None:
         return []
     viewer = RerunViewer(camera, files.colors, options.viewer, options.rrd)
@@ -272,7 +273,7 @@ def _open_viewer(
 def _animations(
     part: Path, camera: Camera, settings: SlamConfig, options: RunOptions
 ) -> list[RunAnimation]:
-    """Return the observer that draws animation.webp; none where it is not wanted."""
+    """Return the observer that draws animation.webp, none if not requested."""
     if not options.animation:
         return []
     return [RunAnimation(part / ANIMATION, OrbExtractor(camera, settings.features))]

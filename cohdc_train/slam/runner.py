@@ -1,4 +1,4 @@
-"""A run over a sequence: frames through the SLAM system, their records, figures, and observers."""
+"""Run of the SLAM system over a sequence, with records, figures, and observers."""
 
 import sys
 import time
@@ -32,7 +32,7 @@ class RunObserver(Protocol):
         """Observe a frame after all work on it.
 
         Where result.is_keyframe, the keyframe of frame.timestamp in the map is this frame. The
-        arrays of the result belong to the map: copy what you change.
+        arrays of the result belong to the map: copy the ones that you change.
         """
         ...
 
@@ -48,7 +48,10 @@ class _Figure:
 
 @dataclass(frozen=True)
 class TrackedSequence:
-    """Result of a run. records: one per frame; trajectory: of the tracked frames, final."""
+    """Result of a run.
+
+    records: one per frame; trajectory: final poses of the tracked frames.
+    """
 
     records: list[FrameRecord]
     trajectory: Trajectory
@@ -64,11 +67,17 @@ def track_sequence(
 ) -> TrackedSequence:
     """Track every frame of a source, finish the map, and draw figures into a new folder.
 
-    on_pose: called with each frame's result as soon as its pose is known; observers: when all work
-    on the frame is done.
+    Args:
+        slam: the SLAM system.
+        source: of frames.
+        mask_of: returns a frame's mask.
+        figures: folder for the figures, which must not exist.
+        observers: called after all work on a frame.
+        on_pose: called with each frame's result as soon as its pose is known.
 
-    Raises DataError for a frame that cannot be used, unless the source is live and has given some,
-    and when no frame comes.
+    Raises:
+        DataError: a frame cannot be used, unless the source is live and had frames before; or the
+            source has no frames.
     """
     count = len(source)
     drawn_frames = _drawn_frames(count)
@@ -86,12 +95,12 @@ def track_sequence(
     except DataError as error:
         if not records or count:
             raise
-        print(f"ended: {error}", file=sys.stderr)  # what a live run has so far is kept
+        print(f"ended: {error}", file=sys.stderr)  # the frames of a live run so far are kept
     finally:
         if records and sys.stderr.isatty():
             print(file=sys.stderr)  # ends the line of progress
     if not records:
-        raise DataError("no frame came: nothing is written")
+        raise DataError("the source has no frames; nothing is written")
     trajectory = slam.finish()
     figures.mkdir()
     for figure in drawn:
@@ -100,7 +109,7 @@ def track_sequence(
 
 
 def _drawn_frames(count: int) -> set[int]:
-    """Return which frames are drawn: the first and then ever rarer ones, where no end is known."""
+    """Return the indices of the frames to draw, at growing intervals where the end is unknown."""
     if count == 0:
         return {0, *(30 << k for k in range(20))}
     chosen = np.linspace(0, count - 1, min(_NUM_FIGURES, count)).round().astype(int)
@@ -133,6 +142,7 @@ def _record(frame: RGBDFrame, result: FrameResult) -> FrameRecord:
 
 
 def _draw(figure: _Figure, extract: OrbExtractor, folder: Path) -> None:
+    """Draw the keypoints of a frame without its mask and with it."""
     frame, mask = figure.frame, figure.mask
     name = frame.timestamp_text
     before = draw_before(frame.rgb, extract(frame.rgb, frame.depth), mask)
@@ -142,8 +152,9 @@ def _draw(figure: _Figure, extract: OrbExtractor, folder: Path) -> None:
 
 
 def _print_progress(done: int, count: int, result: FrameResult) -> None:
-    """Print one line that renews itself on a terminal; elsewhere a line per tenth of the frames, or
-    per hundred frames where no end is known.
+    """Print the progress: one line on a terminal, otherwise a line per tenth of the frames.
+
+    Where the number of frames is unknown, a line is printed per hundred frames.
     """
     state = f"{result.num_inliers} inliers" if result.is_tracked else "lost"
     line = f"frame {done}/{count}  {state}" if count else f"frame {done}  {state}"

@@ -1,4 +1,4 @@
-"""RGB-D SLAM, one frame at a time."""
+"""RGB-D SLAM system that processes one frame at a time."""
 
 import math
 from collections.abc import Callable
@@ -116,11 +116,11 @@ class Slam:
 
     @property
     def num_loops(self) -> int:
-        """Loops closed so far."""
+        """Return the number of loops closed so far."""
         return self._mapper.num_loops
 
     def _build_parts(self, executor: Executor | None) -> TrackerParts:
-        """Build the parts of the tracker, each with its own options."""
+        """Build the components of the tracker, each with its own options."""
         config, camera = self.config, self.camera
         motion = MotionModel(config.motion)
         extractor = OrbExtractor(camera, config.features)
@@ -184,7 +184,7 @@ class Slam:
         )
 
     def _new_intermediate_frames(self) -> IntermediateFrames:
-        """Return an empty store of what frames between keyframes observe."""
+        """Return an empty store of the observations of frames between keyframes."""
         config = self.config
         return IntermediateFrames(config.bundle_adjustment, config.motion.prior_below_points)
 
@@ -205,7 +205,7 @@ class Slam:
 
 
 def _reprojection_model(camera: Camera, config: SlamConfig) -> ReprojectionModel:
-    """Return how measurements are weighted: a stereo pair's baseline, or a virtual one."""
+    """Return the camera model of measurements, with a stereo pair's baseline or a virtual one."""
     if camera.baseline:
         return ReprojectionModel(camera, camera.fx * camera.baseline)
     return ReprojectionModel(camera, config.bundle_adjustment.virtual_bf_px_m)

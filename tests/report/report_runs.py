@@ -75,7 +75,10 @@ class Page(HTMLParser):
 
 
 def trajectory(noise: float = 0.0, lost: Collection[int] = ()) -> Trajectory:
-    """A camera on a helix, looking at the middle, without the lost frames. noise: m."""
+    """Return the trajectory of a camera on a helix, without the lost frames.
+
+    noise: standard deviation of the positions, m.
+    """
     time = np.arange(FRAMES) / RATE
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, :3, 3] = np.stack([np.sin(time), np.cos(time), 0.3 * time], axis=1)

@@ -52,7 +52,7 @@ answer.closed = !dialog.open;
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """A browser on the pages of a run, of a comparison and of a training."""
+    """Open a browser on the pages of a run, a comparison, and a training."""
     folder = tmp_path_factory.mktemp("pages")
     write_truth(folder / "sequence")
     lost = range(20, 35)

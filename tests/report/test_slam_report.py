@@ -21,7 +21,7 @@ LOST = range(20, 35)
 
 @pytest.fixture
 def truth_file(tmp_path: Path) -> Path:
-    """The ground truth of a sequence's folder."""
+    """Write the ground truth into a sequence's folder."""
     return write_truth(tmp_path / "room")
 
 

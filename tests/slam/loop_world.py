@@ -1,4 +1,4 @@
-"""A room of four walls that a camera walks round, with a sensor so poor that it drifts."""
+"""Room of four walls that a camera circles, with a sensor so noisy that tracking drifts."""
 
 from functools import cache
 
@@ -7,22 +7,22 @@ from numpy.typing import NDArray
 from plane_world import CAMERA, Rectangle, render, texture
 
 View = tuple[NDArray[np.uint8], NDArray[np.float32]]
-_HALF = 3.6  # m from the middle to a wall
-_RADIUS = 2.3  # m of the camera's round
+_HALF = 3.6  # m from the center to a wall
+_RADIUS = 2.3  # m, of the camera's circle
 
 
 @cache
 def hall(seed: int = 3) -> list[Rectangle]:
-    """Four walls around the origin, each with its own texture."""
+    """Return four walls around the origin, each with its own texture."""
     rng = np.random.default_rng(seed)
     walls = []
     for turn in np.arange(4) * np.pi / 2:
         ahead = np.array([np.sin(turn), 0.0, np.cos(turn)])
         right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
-        keypoint = _HALF * (ahead - right) + np.array([0.0, -1.4, 0.0])
+        corner = _HALF * (ahead - right) + np.array([0.0, -1.4, 0.0])
         walls.append(
             Rectangle(
-                keypoint,
+                corner,
                 2 * _HALF * right,
                 np.array([0.0, 2.8, 0.0]),
                 texture(rng, 460, 1200, 4800),
@@ -32,8 +32,9 @@ def hall(seed: int = 3) -> list[Rectangle]:
 
 
 def way_round(frames: int, turns: float = 1.1) -> NDArray[np.float64]:
-    """[frames, 4, 4] T_wc of a camera that looks outwards on its way round; the first pose is a
-    turn about nothing.
+    """Return poses [frames, 4, 4] T_wc of a camera that moves in a circle and looks outward.
+
+    The first pose has no rotation.
     """
     angle = np.linspace(0, turns * 2 * np.pi, frames)
     T_wc = np.tile(np.eye(4), (frames, 1, 1))
@@ -45,8 +46,9 @@ def way_round(frames: int, turns: float = 1.1) -> NDArray[np.float64]:
 
 
 def poor_view(T_wc: NDArray[np.float64], rng: np.random.Generator) -> View:
-    """What a noisy sensor gives of the hall: 5 grey levels, and 3 mm of depth at 1 m, growing with
-    its square.
+    """Render the hall with a noisy sensor.
+
+    The standard deviation is 5 gray levels, and 3 mm of depth at 1 m, growing with its square.
     """
     rgb, depth, _ = render(hall(), T_wc, CAMERA)
     noisy = np.clip(rgb + 5 * rng.standard_normal(rgb.shape, dtype=np.float32), 0, 255).astype(

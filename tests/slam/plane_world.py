@@ -1,6 +1,4 @@
-"""A cheap world for tests: textured rectangles seen by a pinhole camera, colour and depth exact to
-the pixel.
-"""
+"""Rendered world for tests: textured rectangles with exact color and depth."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -24,8 +22,10 @@ CAMERA_YAML = "fx: 260\nfy: 260\ncx: 159.5\ncy: 119.5\nwidth: 320\nheight: 240\n
 
 @dataclass(frozen=True)
 class Rectangle:
-    """origin, across, down: [3] m: a corner and the two edges; texture: [h, w, 3] uint8; moving:
-    what a mask covers.
+    """Textured rectangle in space.
+
+    origin: [3] m, a corner; across, down: [3] m, the edges from there; texture: [h, w, 3] uint8;
+    moving: part of the mask.
     """
 
     origin: NDArray[np.float64]
@@ -38,7 +38,7 @@ class Rectangle:
 def texture(
     rng: np.random.Generator, height: int, width: int, patches: int = 900
 ) -> NDArray[np.uint8]:
-    """Overlapping patches of random grey and colour: corners everywhere, no two alike."""
+    """Draw overlapping patches of random color, with distinctive keypoints everywhere."""
     image = np.full((height, width, 3), 120, dtype=np.uint8)
     for _ in range(patches):
         x, y = int(rng.integers(width)), int(rng.integers(height))
@@ -50,7 +50,7 @@ def texture(
 
 @cache
 def room(seed: int = 0) -> list[Rectangle]:
-    """A wall 2.6 m away, a floor, and a box standing before them."""
+    """Return a wall at 2.6 m, a floor, and a box in front of them."""
     rng = np.random.default_rng(seed)
     return [
         Rectangle(
@@ -75,8 +75,9 @@ def room(seed: int = 0) -> list[Rectangle]:
 
 
 def passer_by(step: float, seed: int = 7) -> Rectangle:
-    """A textured board before the camera that goes along with step: the worst kind of mover, full
-    of corners.
+    """Return a textured board that moves with `step` in front of the camera.
+
+    It has many keypoints, the worst case of a moving object.
     """
     left = -1.0 + 0.03 * step
     return Rectangle(
@@ -94,7 +95,7 @@ def _board(seed: int) -> NDArray[np.uint8]:
 
 
 def camera_path(frames: int, later: float = 0.0) -> NDArray[np.float64]:
-    """Return [frames, 4, 4] T_wc of a hand that sways by some 25 cm and 5 degrees."""
+    """Return poses [frames, 4, 4] T_wc of a camera that sways by about 25 cm and 5 degrees."""
     s = (np.arange(frames) + later) / 60.0 * 2 * np.pi
     xi = np.stack([0.25 * np.sin(s), 0.1 * np.sin(2 * s), 0.12 * (1 - np.cos(s))], axis=1)
     turn = np.stack([0.04 * np.sin(s), 0.08 * (1 - np.cos(s)), 0.05 * np.sin(2 * s)], axis=1)
@@ -135,8 +136,10 @@ def _pixels(positions: NDArray[np.float64], size: int) -> slice:
 def render(
     rectangles: list[Rectangle], T_wc: NDArray[np.float64], camera: Camera = CAMERA
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-    """Colour [H, W, 3], depth [H, W] m (0 where nothing is hit), and where moving things are seen
-    [H, W].
+    """Render rectangles into a camera.
+
+    Returns color [H, W, 3], depth [H, W] m with 0 where nothing is hit, and the mask [H, W] of
+    moving rectangles.
     """
     T_cw = np.linalg.inv(T_wc)
     rgb = np.full((camera.height, camera.width, 3), 90, dtype=np.uint8)
@@ -166,7 +169,7 @@ def render(
 
 
 def slam_config(max_keypoints: int, **options: object) -> SlamConfig:
-    """Options with few keypoints; two underscores stand for a dot: loops__enabled=False."""
+    """Return options with few keypoints; two underscores replace a period: loops__enabled=False."""
     dotted = {name.replace("__", "."): value for name, value in options.items()}
     return SlamConfig().override({"features.max_keypoints": max_keypoints, **dotted})
 
@@ -185,8 +188,9 @@ def track(
 
 
 def features_at(pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> Features:
-    """Corners of the finest level at pixels [n, 2] px, free of distortion, and depths [n] m, that
-    look like nothing.
+    """Return features of the finest level at undistorted pixels [n, 2] px with depths [n] m.
+
+    All descriptors are zero.
     """
     none = np.zeros(len(pixels), dtype=np.int64)
     return Features(
@@ -195,15 +199,16 @@ def features_at(pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> Fea
 
 
 def write_sequence(folder: Path, frames: int, with_passer_by: bool = False) -> Path:
-    """A TUM folder of the room with masks/, camera.yaml and groundtruth.txt; 30 frames/s, depth 5
-    ms after colour.
+    """Write a TUM folder of the room with masks/, camera.yaml, and groundtruth.txt.
+
+    It has 30 frames/s, with depth 5 ms after color.
     """
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir(parents=True)
     rows: dict[str, list[str]] = {"rgb": [], "depth": []}
-    poses, lag = camera_path(frames), 0.005 * 30
-    for index, (pose, late) in enumerate(zip(poses, camera_path(frames, lag), strict=True)):
-        boards = [(passer_by(index), passer_by(index + lag))] if with_passer_by else []
+    poses, delay = camera_path(frames), 0.005 * 30
+    for index, (pose, late) in enumerate(zip(poses, camera_path(frames, delay), strict=True)):
+        boards = [(passer_by(index), passer_by(index + delay))] if with_passer_by else []
         rgb, _, moving = render([*room(), *(now for now, _ in boards)], pose)
         depth = render([*room(), *(then for _, then in boards)], late)[1]
         stamp, later = f"{100 + index / 30:.6f}", f"{100.005 + index / 30:.6f}"

@@ -30,13 +30,13 @@ FRAMES = 36
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A TUM folder with a passer-by."""
+    """Write a TUM folder with a person who walks by."""
     return write_sequence(tmp_path_factory.mktemp("walk"), FRAMES, with_passer_by=True)
 
 
 @pytest.fixture(scope="module")
 def masked(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder a run with masks leaves, run by the command line."""
+    """Return the output folder of a run with masks from the command line."""
     out = tmp_path_factory.mktemp("out") / "run"
     arguments = [
         "slam",
@@ -66,7 +66,7 @@ def test_metrics_hold_what_a_script_reads(masked: Path) -> None:
     assert metrics["ate_m"]["rmse"] < 0.006
 
 
-def test_a_run_leaves_trajectory_table_config_and_pictures(masked: Path, sequence: Path) -> None:
+def test_run_writes_trajectory_table_config_and_images(masked: Path, sequence: Path) -> None:
     names = {path.name for path in masked.iterdir()}
     tables = {"trajectory.txt", "metrics.json", "frames.csv", "config.yaml", MANIFEST}
     assert names == tables | {"map.ply", "map.png", "pictures", "report.html"}
@@ -99,7 +99,7 @@ def test_config_of_a_run_repeats_it_to_the_byte(masked: Path, tmp_path: Path) ->
 
 
 def untimed_rows(folder: Path) -> list[dict[str, str]]:
-    """The rows of frames.csv without times."""
+    """Return the rows of frames.csv without times."""
     with (folder / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
     return [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows]
@@ -163,7 +163,7 @@ def test_print_config_shows_the_options_and_runs_nothing(
     assert not (tmp_path / "out").exists()
 
 
-def test_pictures_show_what_was_culled(masked: Path) -> None:
+def test_images_show_masked_keypoints(masked: Path) -> None:
     names = [path.name for path in (masked / "pictures").iterdir()]
     kinds = Counter(name.rpartition("_")[2] for name in names)
     assert kinds.pop("worst.jpg") >= 1
@@ -202,7 +202,7 @@ def test_run_keeps_files_it_did_not_write(
     arguments = ["slam", str(sequence), "--out", str(tmp_path), "--dense_cloud"]
     assert main(arguments) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    names = "config.yaml, pictures, cloud.ply"
+    names = ", ".join(("config.yaml", "pictures", "cloud.ply"))
     assert f"{tmp_path}: holds {names}, not written by a former cohdc slam" in line
     assert "give another --out" in line
     assert files_below(tmp_path) == ["cloud.ply", "config.yaml", "pictures/holiday.jpg"]
@@ -217,14 +217,14 @@ def test_second_run_replaces_its_files_removes_stale_ones_and_keeps_the_rest(
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     slam(write_sequence(long, 8), out=out, settings=slam_config(200), dense_cloud=True)
-    pictures = {name for name in files_below(out / "pictures") if "worst" not in name}
+    images = {name for name in files_below(out / "pictures") if "worst" not in name}
     assert (out / "cloud.ply").is_file()
     (out / "pictures" / "holiday.jpg").write_text("mine")
     slam(write_sequence(short, 2), out=out, settings=slam_config(200))
     assert json.loads((out / "metrics.json").read_text())["frames"] == 2
     assert not (out / "cloud.ply").exists()
     left = {name for name in files_below(out / "pictures") if "worst" not in name}
-    assert left < pictures | {"holiday.jpg"}
+    assert left < images | {"holiday.jpg"}
     assert {(out / name).read_text() for name in ("mine.txt", "pictures/holiday.jpg")} == {"mine"}
     (out / "cloud.ply").write_text("mine")
     assert main(["slam", str(short), "--out", str(out), "--dense_cloud"]) == 1

@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""How well a true mask is carried on by flow and depth, against the true mask of the frame where it
-arrives.
+"""Score masks propagated by flow and depth against the true masks of later frames.
 
     tools/experiments/carried_masks.py --sequences SEQUENCE ... --out OUT [--steps 1 3 6 10]
 
-Every --every-th frame's mask, of the TUM-format sequence's folder `masks`, is carried on through
-those that follow, where there is anybody in it.
+Every --every-th frame's mask, of the TUM-format sequence's folder `masks`, is propagated to those
+that follow, where it shows a person.
 OUT/carried_masks.md has the means, OUT/carried_masks.json the same: IoU, share of the people's
 pixels that are covered, share of all others that are.
 """
@@ -32,8 +31,10 @@ from cohdc_train.types import Mask
 
 
 def halves(folder: Path) -> list[tuple[HalfResFrame, Mask]]:
-    """All frames of a sequence at half size, and their true masks. Raises DataError for what cannot
-    be used.
+    """Return all frames of a sequence at half size, with their true masks.
+
+    Raises:
+        DataError: a file cannot be used.
     """
     camera = choose_camera(folder, None)[0]
     masks = MaskFolder(folder / "masks", camera, MaskConfig())
@@ -44,7 +45,7 @@ def halves(folder: Path) -> list[tuple[HalfResFrame, Mask]]:
 
 
 def carried_on(frames: list[tuple[HalfResFrame, Mask]]) -> list[Mask]:
-    """The first frame's mask in each of the others."""
+    """Propagate the first frame's mask to each of the others."""
     propagation = MaskPropagator()
     first, mask = frames[0]
     propagation.update(mask, propagation.advance(first), first)

@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""What CQE's quality is worth to SLAM: bands of doubt by quality, bands alike, and the paper's
-filter at 0.9.
+"""Compare masks dilated by CQE quality, dilated alike, and filtered at 0.9 as in the paper.
 
     tools/experiments/culling_ablation.py --sequences DIR [DIR ...] --out OUT [--model person]
         [--seeds 0 1 2] [--settings OPTION=VALUE ...]
@@ -87,7 +86,7 @@ def parse() -> argparse.Namespace:
 
 
 def ways(found: Iterable[Detections], labels: frozenset[int]) -> dict[str, MaskConfig]:
-    """What is compared, on the detections of a sequence."""
+    """Return the mask options that are compared, for the detections of a sequence."""
     qualities = [q for one in found for q in select_dynamic(one, labels, BY_QUALITY).quality]
     alike = round(dilation_for(BY_QUALITY, float(np.mean(qualities or [1.0]))))
     return {
@@ -122,8 +121,9 @@ def write_masks(
 
 
 def table(rows: list[Row]) -> str:
-    """ATE RMSE m, median (worst) over the seeds, with least coverage, and what the masks cover and
-    lose.
+    """Return a table of ATE RMSE in m, coverage, and the pixels that masks cover and lose.
+
+    The errors are the median and the worst over the seeds, the coverage is the least.
     """
     lines = [
         "| sequence | culling | people covered | others lost | ATE RMSE, m | frames |",

@@ -2,7 +2,7 @@
 """Prove that a refactoring changes no result: run the same cases on two commits, compare bytes.
 
     tools/experiments/golden.py BASE HEAD [--cases slam_xyz train ...] [--shared ../shared]
-        [--timing N] [--keep DIR] [--pictures]
+        [--timing N] [--keep DIR] [--images]
 
 Both commits are checked out with `git worktree` into a temporary folder. Each command runs in a
 process of its own on one thread; inputs are rendered or trained once, with BASE. One line per case
@@ -10,8 +10,8 @@ says equal, DIFFERENT (which files), FAILED or skipped, then a digest of BASE's 
 seconds of BASE and HEAD (wall, and CPU). The exit code is 1 when a case differs or fails, and 2
 when a commit cannot be checked out.
 
-Bits depend on CPU and library versions: compare digests within one run only. Times, speeds and
-versions are left out, config.yaml too; drawn pictures only count with --pictures. Options that HEAD
+Bits depend on CPU and library versions: compare digests within one run only. Times, speeds,
+versions, and config.yaml are not compared, and drawn images only with --images. Options that HEAD
 has renamed belong into RENAMED_OPTIONS of golden_checkout.py, classes that it has moved into
 golden_flow.py. The tool uses the cases of the working tree that it lies in, not of BASE or HEAD.
 
@@ -45,14 +45,14 @@ class Pair:
         (folder / "inputs").mkdir(parents=True)
         self.inputs = Inputs(folder / "inputs", base, shared)
 
-    def run(self, case: Case, with_pictures: bool) -> tuple[Comparison, list[Elapsed]]:
+    def run(self, case: Case, with_images: bool) -> tuple[Comparison, list[Elapsed]]:
         """Run a case in both and compare. Raises CommandFailedError."""
         source = case.prepare(self.inputs)
         folders = [self.folder / side / case.name for side in ("base", "head")]
         times = []
         for checkout, folder in zip(self.checkouts, folders, strict=True):
             times.append(run_commands(checkout, case, source, folder))
-        return compare_folders(folders[0], folders[1], with_pictures), times
+        return compare_folders(folders[0], folders[1], with_images), times
 
     def alternate(self, case: Case, repetitions: int) -> list[list[Elapsed]]:
         """Return the times of both, run in turn."""
@@ -73,14 +73,14 @@ def run_commands(checkout: Checkout, case: Case, source: Path, folder: Path) -> 
     return Elapsed(sum(time.wall for time in times), sum(time.cpu for time in times))
 
 
-def report(pair: Pair, case: Case, with_pictures: bool) -> bool:
+def report(pair: Pair, case: Case, with_images: bool) -> bool:
     """Run a case, print its line, and return whether all is equal."""
     missing = [name for name in case.needs if not (pair.inputs.shared / name).exists()]
     if missing:
         print(f"{case.name:<16}skipped: no {', '.join(missing)} in the shared folder", flush=True)
         return True
     try:
-        comparison, times = pair.run(case, with_pictures)
+        comparison, times = pair.run(case, with_images)
     except CommandFailedError as error:
         print(f"{case.name:<16}FAILED     {error}", flush=True)
         return False
@@ -116,7 +116,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--shared", type=Path, default=REPOSITORY.parent / "shared")
     parser.add_argument("--timing", type=int, default=0, metavar="N", help="runs of slam_xyz each")
     parser.add_argument("--keep", type=Path, help="new folder that inputs and results stay in")
-    parser.add_argument("--pictures", action="store_true", help="compare drawn pictures, too")
+    parser.add_argument("--images", action="store_true", help="compare drawn images, too")
     return parser.parse_args()
 
 
@@ -144,7 +144,7 @@ def run(arguments: argparse.Namespace) -> bool:
         folder = (arguments.keep or temporary / "results").resolve()
         pair = Pair(base, head, folder, arguments.shared.resolve())
         chosen = [case for case in CASES if case.name in arguments.cases]
-        equal = [report(pair, case, arguments.pictures) for case in chosen]
+        equal = [report(pair, case, arguments.images) for case in chosen]
         timed = CASES[_NAMES.index("slam_xyz")]
         if arguments.timing and timed.name in arguments.cases:
             report_timing(pair, timed, arguments.timing)

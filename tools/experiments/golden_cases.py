@@ -78,8 +78,8 @@ def _train(people: Path) -> list[Command]:
 
 
 def _export(checkpoint: Path) -> list[Command]:
-    pictures = checkpoint.parent / "people" / "images"
-    return [["cohdc", "export", str(checkpoint), "--out", "model.onnx", "--images", str(pictures)]]
+    images = checkpoint.parent / "people" / "images"
+    return [["cohdc", "export", str(checkpoint), "--out", "model.onnx", "--images", str(images)]]
 
 
 def _scores(folder: Path) -> list[Command]:

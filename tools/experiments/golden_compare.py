@@ -1,4 +1,4 @@
-"""Compare two result folders byte by byte, without times, versions and drawn pictures."""
+"""Compare two result folders byte by byte, without times, versions, and drawn images."""
 
 import csv
 import hashlib
@@ -12,7 +12,7 @@ from typing import Any
 # JSON keys and CSV columns whose values change from run to run, or from release to release.
 _VOLATILE = re.compile(r"(.*_)?(ms|fps|seconds)|behind_s|speed/.*|version")
 _EXCEPTED_FILES = re.compile(r"config\.yaml|hparams\.yaml|.*\.log|events\.out\.tfevents\..*")
-_PICTURE_FOLDERS = {"pictures", "overlays"}
+_IMAGE_FOLDERS = {"pictures", "overlays"}
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class Comparison:
     num_files: int
 
 
-def compare_folders(base: Path, head: Path, with_pictures: bool = False) -> Comparison:
+def compare_folders(base: Path, head: Path, with_images: bool = False) -> Comparison:
     """Compare all result files of two folders.
 
     Args:
         base: first folder.
         head: second folder.
-        with_pictures: compare the files in folders of drawn pictures, too.
+        with_images: compare the files in folders of drawn images, too.
     """
-    base_files = result_files(base, with_pictures)
-    head_files = result_files(head, with_pictures)
+    base_files = result_files(base, with_images)
+    head_files = result_files(head, with_images)
     digest = hashlib.sha256()
     different = []
     for name in sorted(base_files | head_files):
@@ -55,15 +55,15 @@ def compare_folders(base: Path, head: Path, with_pictures: bool = False) -> Comp
     return Comparison(different, digest.hexdigest(), len(base_files))
 
 
-def result_files(folder: Path, with_pictures: bool = False) -> set[str]:
+def result_files(folder: Path, with_images: bool = False) -> set[str]:
     """Return the paths, relative to a folder, of the files that are compared."""
     names = set()
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
-        is_picture = bool(_PICTURE_FOLDERS.intersection(relative.parts[:-1]))
+        is_image = bool(_IMAGE_FOLDERS.intersection(relative.parts[:-1]))
         is_excepted = bool(_EXCEPTED_FILES.fullmatch(path.name))
         is_result = path.is_file() and not is_excepted
-        if is_result and (with_pictures or not is_picture):
+        if is_result and (with_images or not is_image):
             names.add(relative.as_posix())
     return names
 

@@ -79,7 +79,7 @@ def run_system(sequence: Path) -> FlowRun:
 
 
 def run_tracker(sequence: Path) -> FlowRun:
-    """Drive `Tracker(camera, features, seed, method, executor, spent)`."""
+    """Drive the Tracker of old checkouts, which takes its options as single arguments."""
     slam = "cohdc_train.slam"
     executor = first_of(
         f"{slam}.runtime.executors:SynchronousExecutor",

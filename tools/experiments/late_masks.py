@@ -42,8 +42,9 @@ from cohdc_train.types import Mask
 
 
 class LateMasks:
-    """Masks as `AsyncSegmenter` makes them, of a segmenter that takes `late` frames; the first is
-    waited for.
+    """Masks as `AsyncSegmenter` makes them, of a segmenter that takes `late` frames.
+
+    The first frame waits for its mask.
     """
 
     def __init__(self, segment: SegmentFunction, late: int) -> None:
@@ -71,7 +72,7 @@ class LateMasks:
 
 
 def remembered(segment: SegmentFunction) -> SegmentFunction:
-    """The same, asked once for every frame."""
+    """Cache a segmenter's masks by frame name."""
     known: dict[str, tuple[Mask, float]] = {}
 
     def ask(view: RGBDFrame) -> tuple[Mask, float]:
@@ -83,7 +84,11 @@ def remembered(segment: SegmentFunction) -> SegmentFunction:
 
 
 def opened(folder: Path, model: Path | None) -> tuple[RecordedSequence, SegmentFunction]:
-    """A sequence, and what outlines its people. Raises DataError for what cannot be used."""
+    """Open a sequence, and the source of its masks.
+
+    Raises:
+        DataError: a file cannot be used.
+    """
     camera = choose_camera(folder, None)[0]
     source = RecordedSequence(folder, camera, rgbd_format(camera))
     if source.groundtruth is None:
@@ -135,7 +140,7 @@ def main() -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """What there is so far is written after every line."""
+    """Run all sequences, and write the table after every line."""
     rows, lines = (
         [],
         ["| sequence | late by frames | mean ATE RMSE, m | each |", "|---|---|---|---|"],

@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""Dynamic SLAM scored on rendered sequences whose truth is exact: walks, carts, crowds, a loop,
-plain walls and more.
+"""Score dynamic SLAM on rendered sequences: walks, carts, crowds, a loop, plain walls, and more.
 
     tools/experiments/slam_evaluation.py --root DIR --out OUT [--model person] [--seeds 0 1 2]
         [--settings loops.enabled=false ...]
@@ -201,7 +200,7 @@ def tables(rows: list[Row]) -> str:
 
 
 def cell(rows: list[Row]) -> str:
-    """What one mode did on one sequence."""
+    """Return the table cell of one mode on one sequence."""
     if not rows:
         return "-"
     known = [row["ate_m"] for row in rows if row["ate_m"] is not None]

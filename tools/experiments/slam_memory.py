@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""How `cohdc slam`'s memory and time grow over minutes: a recorded sequence, played forth and back,
-synchronously.
+"""Measure memory and time of `cohdc slam` over minutes of a sequence played forth and back.
 
     tools/experiments/slam_memory.py --sequence DIR --out OUT [--frames 18000] [--features 500]
         [--shrink 2] [--settings OPTION=VALUE ...]
@@ -91,7 +90,7 @@ class ForthAndBack:
             yield RGBDFrame(t, rgb.copy(), meters, name=f"{number}")
 
     def _truth(self, truth: Trajectory, stamps: np.ndarray) -> Trajectory:
-        """The pose nearest in time to every image, at the times they are played."""
+        """Return the true pose of every image at the times when it is played."""
         row = dict(associate(stamps, truth.timestamps, 0.02).tolist())
         known = [
             (number / RATE, row[place]) for number, place in enumerate(self._order) if place in row
@@ -101,7 +100,7 @@ class ForthAndBack:
 
 
 def shrunk(camera: Camera, by: int) -> Camera:
-    """The camera of images a by-th as wide and high."""
+    """Return the camera of images whose sides are divided by `by`."""
     c = camera
     cx, cy = (c.cx + 0.5) / by - 0.5, (c.cy + 0.5) / by - 0.5
     size = {"width": c.width // by, "height": c.height // by}

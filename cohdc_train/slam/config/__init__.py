@@ -1,4 +1,4 @@
-"""Options of the SLAM system: one frozen dataclass per part, and the tree of them."""
+"""Options of the SLAM system, one frozen dataclass per component."""
 
 from cohdc_train.slam.config.dynamics import (
     FreeSpaceConfig,

@@ -33,9 +33,11 @@ class Check:
                 self._demand(name, value, low <= value <= high, f"{low:g} to {high:g}")
 
     def _values(self, name: str) -> tuple[float, ...]:
+        """Return the numbers of an option."""
         value = getattr(self._config, name)
         return value if isinstance(value, tuple) else (value,)
 
     def _demand(self, name: str, value: float, is_allowed: bool, allowed: str) -> None:
+        """Raise DataError unless a value is allowed."""
         if not is_allowed:
             raise DataError(f"{self._section}.{name} is {value:g}; allowed: {allowed}")

@@ -51,9 +51,9 @@ class FreeSpaceConfig:
     """Moving objects of any class, by depth in space that keyframes saw free (as DynaSLAM).
 
     Args:
-        enabled: find what moves by depth, and use masked objects again that stay static.
+        enabled: detect moving objects by depth, and use masked objects again that stay static.
         cell_px: side of a cell of the depth grid, px.
-        min_violation_m: depth by which a point must lie before what a keyframe saw, m.
+        min_violation_m: depth by which a point must lie in front of a keyframe's reading, m.
         min_violation_per_m: the same per m of depth, in addition.
         min_depth_m: nearest depth the sensor measures, m.
         max_depth_m: farthest depth used, m.
@@ -64,7 +64,7 @@ class FreeSpaceConfig:
         max_moving_ratio: free-space violations of a static object, as a share of the readings that
             agree.
         reference_keyframes: keyframes whose depth a frame is compared with.
-        mask_margin_px: dilation of what depth shows to move, px.
+        mask_margin_px: dilation of the moving objects detected by depth, px.
         recent_s: time for which a surface must be static not to join a moving one, s.
         rest_s: time after which a static object is used again, s.
     """

@@ -88,8 +88,8 @@ class RefinementConfig:
         enabled: move matched keypoints to where their points' patches fit best.
         patch_px: side of a stored patch, px at its keypoint's level.
         template_px: side of the part of it that is compared, px.
-        max_level: coarsest pyramid level whose keypoints are refined; coarser patches are so wide
-            that they are seldom flat.
+        max_level: coarsest pyramid level whose keypoints are refined; coarser patches are large,
+            and rarely show a plane.
         max_iterations: Gauss-Newton iterations.
         max_shift_px: largest shift, px at the keypoint's level; a better fit further away is
             another place.

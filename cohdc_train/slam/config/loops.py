@@ -1,4 +1,4 @@
-"""Options of loop closing."""
+"""Options of place recognition, loop verification, and the pose graph."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from cohdc_train.slam.config.checks import Check
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Recognition of places seen before, and the pose graph that closes loops (paper section 2.3).
+    """Place recognition, and the pose graph that closes loops (paper section 2.3).
 
     Args:
         enabled: close loops.
@@ -21,7 +21,7 @@ class LoopConfig:
         graph_neighbors: older neighbors of a keyframe in the pose graph, beside the one before it.
         edge_sigma: standard deviation of the relative pose of two keyframes that share edge_points
             points, m and rad.
-        edge_points: the number of shared points for which edge_sigma holds.
+        edge_points: number of shared points to which edge_sigma applies.
         min_edge_weight: weight that the pose graph must leave to a new loop.
         hash_tables: tables of the locality-sensitive hashing.
         hash_bits: bits of a descriptor per table, of 256.

@@ -7,10 +7,10 @@ from cohdc_train.slam.config.checks import Check
 
 @dataclass(frozen=True)
 class DepthConfig:
-    """Range of usable depth; readings beyond it err too much.
+    """Range of usable depth, beyond which readings are too inaccurate.
 
     Args:
-        max_depth_m: farthest usable reading of a depth camera, m; a Kinect errs by 4 cm there.
+        max_depth_m: farthest usable reading of a depth camera, m; a Kinect's error is 4 cm there.
         max_depth_baselines: farthest usable depth of a stereo pair, in baselines (ORB-SLAM2's
             close points).
     """

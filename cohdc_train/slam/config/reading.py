@@ -1,4 +1,4 @@
-"""Reading of options from YAML and from dotted names, with types checked."""
+"""Reading of options from YAML files and dotted names, with type checks."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -15,7 +15,7 @@ _Config = TypeVar("_Config")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read the options of a YAML file; of a run's config.yaml those under `settings`."""
+    """Read the options of a YAML file; from a run's config.yaml, those under `settings`."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -32,7 +32,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def as_plain(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options as YAML holds them: tuples become lists, and paths text."""
+    """Convert options to YAML types: tuples become lists, and paths become text."""
     result: dict[str, Any] = {}
     for name, value in options.items():
         if isinstance(value, Mapping):
@@ -59,8 +59,14 @@ def nested(options: Mapping[str, object]) -> dict[str, Any]:
 def changed(config: _Config, options: Mapping[str, Any], where: str, prefix: str = "") -> _Config:
     """Return a copy of a config dataclass with some fields changed, sections recursively.
 
-    where: what the messages name, such as a file. Raises DataError for an unknown option and for a
-    value of a wrong type or out of range.
+    Args:
+        config: the dataclass.
+        options: new values, nested by section.
+        where: origin of the options for error messages, such as a file.
+        prefix: section of the options, with a period at the end.
+
+    Raises:
+        DataError: an option is unknown, or a value has a wrong type or is out of range.
     """
     if not isinstance(options, Mapping):
         raise DataError(f"{where}: {prefix.rstrip('.')} is {options!r}, not a mapping of options")
@@ -84,12 +90,13 @@ def changed(config: _Config, options: Mapping[str, Any], where: str, prefix: str
 
 
 def _suggestion(name: str, names: list[str]) -> str:
+    """Return the end of an error message: the closest name, or all names."""
     close = get_close_matches(name, names, 1, 0.5)
     return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(names)}"
 
 
 def _converted(value: Any, hint: Any, what: str) -> Any:
-    """Return a value as its field's type holds it; raise DataError for another type."""
+    """Convert a value to its field's type; raise DataError where that is impossible."""
     if isinstance(hint, UnionType):
         if value is None:
             return None

@@ -1,4 +1,4 @@
-"""The tree of all options of the SLAM system."""
+"""Options of the whole SLAM system."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -96,16 +96,19 @@ class SlamConfig:
 
     @classmethod
     def from_yaml(cls, path: Path) -> "SlamConfig":
-        """Read options from a YAML file: of sections, or a run's config.yaml with its `settings`.
+        """Read options from a YAML file of sections, or from a run's config.yaml.
 
-        Options that the file does not name keep their defaults. Raises DataError that names the
-        file and the option.
+        Options that the file does not name keep their defaults.
+
+        Raises:
+            DataError: an option is unknown or has a wrong value; the message names file and option.
         """
         return changed(cls(), read_yaml(path), str(path))
 
     def override(self, options: Mapping[str, object]) -> "SlamConfig":
         """Return a copy with some options changed, such as {"loops.enabled": False}.
 
-        Raises DataError for an unknown option, a wrong type, and a value out of range.
+        Raises:
+            DataError: an option is unknown, or a value has a wrong type or is out of range.
         """
         return changed(self, nested(options), "SlamConfig")

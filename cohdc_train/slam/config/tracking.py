@@ -109,7 +109,7 @@ class MotionModelConfig:
         pose_noise_floor: least standard deviation of a measured pose, m and rad.
         max_gap_s: longest gap between two frames over which the velocity is used, s.
         min_gap_s: shortest gap from which a velocity is computed, s.
-        max_prediction_s: time after which the uncertainty grows no more, s.
+        max_prediction_s: time after which the uncertainty stops growing, s.
         prior_below_points: points of a frame, below which the motion prior counts.
         nis_smoothing: weight of the latest frame in the mean normalized innovation squared.
         max_nis: normalized innovation squared above which a pose is a jump.

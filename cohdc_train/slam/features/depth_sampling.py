@@ -13,12 +13,18 @@ def sample_depth(
     config: FeatureConfig,
     mask: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """Read the depth at keypoints, except near depth edges and near the mask.
+    """Read the depth at keypoints, except near depth edges and near the dynamic mask.
 
-    A sensor mixes near and far there.
+    A sensor mixes near and far surfaces there.
 
-    depth: [H, W] m, 0 = none; pixels: [n, 2] px; mask: [H, W], True = dynamic. Returns [n] m, nan
-    where refused.
+    Args:
+        depth: [H, W] m, 0 = no reading.
+        pixels: [n, 2] px, distorted.
+        config: size of the patch, largest depth step, and margin of the mask.
+        mask: [H, W] bool, True = dynamic.
+
+    Returns:
+        [n] depth, m; nan where it is refused.
     """
     if len(pixels) == 0:
         return np.zeros(0)
@@ -30,7 +36,7 @@ def sample_depth(
     rows = np.clip(y + offsets[:, None], 0, height - 1)
     patch = depth.ravel().take(
         (rows[:, None] * width + columns).reshape(-1, len(pixels))
-    )  # [25, n]
+    )  # [pixels of the patch, n]
     center = patch[len(patch) // 2].astype(np.float64)
     far = patch.max(axis=0).astype(np.float64)
     near = np.where(patch > 0, patch, np.float32(np.inf)).min(axis=0).astype(np.float64)

@@ -22,17 +22,17 @@ class ScalePyramid:
 
     @classmethod
     def from_config(cls, config: FeatureConfig) -> "ScalePyramid":
-        """Return the pyramid of an extractor."""
+        """Return the pyramid that an extractor with these options uses."""
         return cls(config.scale_factor, config.num_levels, config.subpixel_sigma_px)
 
     def scales(self, octaves: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the px of level 0 per px of each level, of octaves [n]."""
+        """Return the scale [n] of pyramid levels [n], px of level 0 per px of the level."""
         return np.asarray(self.factor**octaves, dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Keypoints:
-    """Positions and descriptors of n keypoints; fields as in Features."""
+    """Positions, levels, and descriptors of n keypoints; the fields are those of Features."""
 
     pixels: NDArray[np.float64]
     octaves: NDArray[np.int64]
@@ -82,28 +82,29 @@ class Features:
         return len(self.pixels)
 
     def keypoints(self, rows: NDArray[np.int64]) -> Keypoints:
-        """Return the chosen rows, without undistorted positions and depths."""
+        """Return the keypoints of the chosen rows, without undistorted positions and depths."""
         return Keypoints(self.pixels, self.octaves, self.descriptors, self.is_subpixel).take(rows)
 
     def marked_subpixel(self, rows: NDArray[np.int64], is_subpixel: bool) -> "Features":
-        """Return the same keypoints, the chosen rows marked as refined or not."""
+        """Return a copy in which the chosen rows are marked as refined to subpixels, or as not."""
         marks = self.is_subpixel.copy()
         marks[rows] = is_subpixel
         return replace(self, is_subpixel=marks)
 
     @property
     def without_subpixel(self) -> "Features":
-        """Return the same keypoints with none marked as refined, to measure other points."""
+        """Return a copy in which no keypoint is marked as refined, to measure other points."""
         return replace(self, is_subpixel=np.zeros_like(self.is_subpixel))
 
     @property
     def scales(self) -> NDArray[np.float64]:
-        """Return [n] px of the image per px of each keypoint's pyramid level."""
+        """Return the scale [n] of each keypoint, px of level 0 per px of its pyramid level."""
         return self.pyramid.scales(self.octaves)
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
-        """Return [n] standard deviations of the positions, px: one px of the level, less where
-        refined.
+        """Return the standard deviation [n] of each keypoint's position, px of level 0.
+
+        It is one px of the keypoint's level, and less where the keypoint is refined.
         """
         return np.where(self.is_subpixel, self.pyramid.subpixel_sigma_px, 1.0) * self.scales

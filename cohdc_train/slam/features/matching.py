@@ -24,13 +24,13 @@ class Matches:
         return len(self.point_ids)
 
     def take(self, rows: NDArray[np.bool_]) -> "Matches":
-        """The chosen rows."""
+        """Return the matches of the chosen rows [m] bool."""
         return Matches(self.point_ids[rows], self.keypoints[rows])
 
 
 @dataclass(frozen=True)
 class Projected:
-    """Map points as a camera should see them.
+    """Map points projected into a camera.
 
     ids: [m] int64; pixels: [m, 2] undistorted px; levels: [m] int64 pyramid level expected;
     descriptors: [m, 4] uint64.
@@ -51,14 +51,22 @@ def match_projected(
 ) -> Matches:
     """Match each point with the nearest descriptor among the keypoints near its projection.
 
-    radius_px: at level 0; it grows with the keypoint's scale up to config.max_radius_scale.
-    max_hamming: bits, in place of config.max_hamming. A keypoint matches one point.
+    Args:
+        projected: the points, projected by the predicted pose.
+        features: keypoints of the frame.
+        radius_px: search radius at level 0; it grows with the keypoint's scale up to
+            config.max_radius_scale.
+        config: descriptor limits.
+        max_hamming: largest distance in bits, in place of config.max_hamming.
+
+    Returns:
+        Matches, at most one per point and per keypoint.
     """
     limit = config.max_hamming if max_hamming is None else max_hamming
     if len(projected.ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     reach = radius_px * np.minimum(features.scales, config.max_radius_scale)
-    i, j = _neighbors(projected, features, float(reach.max()))
+    i, j = _candidate_pairs(projected, features, float(reach.max()))
     x, y = projected.pixels.T.take(i, axis=1) - features.undistorted.T.take(j, axis=1)
     near = np.flatnonzero(x * x + y * y <= (reach * reach)[j])
     i, j = i[near], j[near]
@@ -68,32 +76,32 @@ def match_projected(
     return Matches(projected.ids[i], j)
 
 
-def _neighbors(
+def _candidate_pairs(
     projected: Projected, features: Features, reach: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of a point and a corner, [k] rows of each: all within one level and `reach` px, and
-    some further off.
+    """Return all pairs of a point and a keypoint that are at most one level and `reach` px apart.
 
-    Corners are sorted by level and square cell of that size. The three cells side by side in which
-    a point looks are then one piece of the sorted list; there are nine such pieces, of three rows
-    on three levels.
+    Some pairs that are further apart are returned as well. Keypoints are sorted by level and by
+    square cell of that size. The three cells of a row in which a point is searched are then one
+    slice of the sorted keypoints; there are nine such slices, of three rows on three levels.
+
+    Returns:
+        [k] rows of the points, and [k] rows of the keypoints.
     """
-    keypoint = features.undistorted.min(axis=0) - reach
-    cells = ((features.undistorted - keypoint) / reach).astype(
-        np.int64
-    )  # from 1 on: a rim of empty cells lies around
+    origin = features.undistorted.min(axis=0) - reach
+    # Cells count from 1, so that a border of empty cells surrounds them.
+    cells = ((features.undistorted - origin) / reach).astype(np.int64)
     width, height = (cells.max(axis=0) + 2).tolist()
     key = ((features.octaves + 1) * height + cells[:, 1]) * width + cells[:, 0]
     order = np.argsort(key, kind="stable")
     num_levels = features.pyramid.num_levels + 2
     begins = np.r_[0, np.cumsum(np.bincount(key, minlength=num_levels * height * width))]
-    places = np.floor((projected.pixels - keypoint) / reach).astype(np.int64)
-    x, y = np.clip(places, 0, (width - 1, height - 1)).T
-    beside = np.arange(-1, 2)[:, None]
-    levels = projected.levels + 1 + beside[:, None]
-    rows = (
-        levels * height + np.clip(y + beside, 0, height - 1)
-    ) * width  # a row at the rim comes twice, but is empty
+    point_cells = np.floor((projected.pixels - origin) / reach).astype(np.int64)
+    x, y = np.clip(point_cells, 0, (width - 1, height - 1)).T
+    offsets = np.arange(-1, 2)[:, None]
+    levels = projected.levels + 1 + offsets[:, None]
+    # A row at the border may be searched twice, but it is empty.
+    rows = (levels * height + np.clip(y + offsets, 0, height - 1)) * width
     low = begins[rows + np.maximum(x - 1, 0)].ravel()
     count = begins[rows + np.minimum(x + 2, width)].ravel() - low
     j = order[np.repeat(low - np.cumsum(count) + count, count) + np.arange(count.sum())]
@@ -103,9 +111,20 @@ def _neighbors(
 def one_to_one(
     i: NDArray[np.int64], j: NDArray[np.int64], bits: NDArray[np.int64], ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Candidate pairs [k] with their distances, thinned: the best j of every i that passes the
-    ratio, then of every j the best i."""
-    order = _by(i, bits, j)
+    """Reduce candidate pairs to unambiguous one-to-one matches.
+
+    The best j of every i must pass the ratio test; then every j keeps its best i.
+
+    Args:
+        i: [k] first row of each pair.
+        j: [k] second row of each pair.
+        bits: [k] Hamming distance of each pair.
+        ratio: share of the second-best distance that the best may have (Lowe's ratio test).
+
+    Returns:
+        The rows i and j of the matches.
+    """
+    order = _sorted_rows(i, bits, j)
     i, j, bits = i[order], j[order], bits[order]
     first = np.r_[True, i[1:] != i[:-1]][: len(i)]
     best = np.flatnonzero(first)
@@ -113,16 +132,17 @@ def one_to_one(
     has_second = (second > best) & (i[second] == i[best])
     clear = ~has_second | (bits[best] <= ratio * bits[second])
     i, j, bits = i[best][clear], j[best][clear], bits[best][clear]
-    order = _by(j, bits, i)
+    order = _sorted_rows(j, bits, i)
     first = np.r_[True, j[order][1:] != j[order][:-1]][: len(j)]
     return i[order][first], j[order][first]
 
 
-def _by(
+def _sorted_rows(
     first: NDArray[np.int64], bits: NDArray[np.int64], last: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The order by first, then bits, 0..256, then last, of rows that all differ: one key sorts
-    faster than three.
+    """Sort distinct rows by `first`, then by `bits` (0..256), then by `last`.
+
+    A single combined key sorts faster than three keys.
     """
     return np.argsort((first * 257 + bits) * (int(last.max(initial=0)) + 1) + last)
 
@@ -133,21 +153,20 @@ def match_descriptors(
     features: Features,
     config: MatchingConfig,
 ) -> Matches:
-    """Match mutually nearest descriptors without a pose.
+    """Match mutually nearest descriptors, without a pose.
 
     ids: [m] map points; descriptors: [m, 4] of these points.
     """
     if len(ids) == 0 or len(features) == 0:
         return Matches(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    alike = (
-        _signs(descriptors) @ _signs(features.descriptors).T
-    )  # 256 bits less twice those that differ
-    nearest = alike.argmax(axis=1)
-    rows = np.flatnonzero(alike.argmax(axis=0)[nearest] == np.arange(len(ids)))
-    rows = rows[alike[rows, nearest[rows]] >= 256 - 2 * config.max_hamming_unguided]
+    # The similarity is 256 minus twice the number of bits that differ.
+    similarity = _signs(descriptors) @ _signs(features.descriptors).T
+    nearest = similarity.argmax(axis=1)
+    rows = np.flatnonzero(similarity.argmax(axis=0)[nearest] == np.arange(len(ids)))
+    rows = rows[similarity[rows, nearest[rows]] >= 256 - 2 * config.max_hamming_unguided]
     return Matches(ids[rows], nearest[rows])
 
 
 def _signs(descriptors: NDArray[np.uint64]) -> NDArray[np.float32]:
-    """[m, 256] 1 for each set bit of descriptors [m, 4], -1 for each other."""
+    """Map the bits of descriptors [m, 4] to [m, 256], 1 for a set bit and -1 for any other."""
     return bits_of(descriptors).astype(np.float32) * 2 - 1

@@ -1,4 +1,4 @@
-"""Image patches: cut, warped and aligned (paper eqs. 8 and 9)."""
+"""Sampling, warping, and alignment of image patches (paper eqs. 8 and 9)."""
 
 import cv2
 import numpy as np
@@ -8,15 +8,15 @@ from cohdc_train.slam.config import RefinementConfig
 from cohdc_train.slam.features.keypoints import ScalePyramid
 from cohdc_train.slam.geometry.se3 import Array
 
-_AT_ONCE = 1024  # patches that are warped in one call
+_PATCHES_PER_CALL = 1024  # OpenCV limits the size of an image that it remaps
 Floats = NDArray[np.float32]
 
 
 class Pyramid:
-    """Gray image at the finer levels of the keypoints."""
+    """Gray image at the finer levels of the keypoint pyramid."""
 
     def __init__(self, gray: NDArray[np.uint8], scale: ScalePyramid, max_level: int) -> None:
-        """Downsample an image [H, W] to the levels 0 to max_level of a pyramid."""
+        """Downsample an image [H, W] uint8 to the levels 0 to max_level of a pyramid."""
         height, width = gray.shape
         levels = [gray]
         for level in range(1, max_level + 1):
@@ -28,10 +28,16 @@ class Pyramid:
     def cut(
         self, pixels: Array, octaves: NDArray[np.int64], side: int, shift: Array | float = 0.0
     ) -> Floats:
-        """Grey values of the square around each of pixels [n, 2] px of level 0. side, and shift [n,
-        2]: px of each one's own level.
+        """Sample the gray values of a square patch around each pixel.
 
-        Returns [n, side * side], row by row; beyond the border the border's.
+        Args:
+            pixels: [n, 2] centers, px of level 0.
+            octaves: [n] pyramid level of each patch.
+            side: side of the patches, px of their level.
+            shift: [n, 2] offset of the centers, px of their level.
+
+        Returns:
+            [n, side * side] values, row by row; the border is replicated outside the image.
         """
         result = np.empty((len(pixels), side * side), dtype=np.float32)
         height, width = self.levels[0].shape
@@ -40,33 +46,42 @@ class Pyramid:
             rows = np.flatnonzero(octaves == level)
             image = self.levels[level]
             share = np.array([image.shape[1] / width, image.shape[0] / height])
-            places = ((pixels[rows] + 0.5) * share - 0.5 + shift[rows]).astype(np.float32)
-            x, y = places[:, :1] + right, places[:, 1:] + down
+            positions = ((pixels[rows] + 0.5) * share - 0.5 + shift[rows]).astype(np.float32)
+            x, y = positions[:, :1] + right, positions[:, 1:] + down
             result[rows] = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return result
 
 
 def patch_grid(side: int) -> Floats:
-    """[2, side * side] offsets x and y of a square's pixels from its middle, px, row by row."""
-    places = np.arange(side, dtype=np.float32) - (side - 1) / 2
-    return np.stack([np.tile(places, side), np.repeat(places, side)])
+    """Return the offsets [2, side * side] (x, y) of a square's pixels from its center, px."""
+    positions = np.arange(side, dtype=np.float32) - (side - 1) / 2
+    return np.stack([np.tile(positions, side), np.repeat(positions, side)])
 
 
 def warp_patches(patches: NDArray[np.uint8], inverse: Array, side: int) -> Floats:
-    """[n, side, side]: I_r[A(u)] of eq. 8. inverse: [n, 2, 2] px of the patch per px of the image,
-    at their levels.
+    """Warp patches into a frame by their affine maps: I_r[A(u)] of eq. 8.
+
+    Args:
+        patches: [n, h, h] uint8 patches around the points, at their reference keyframes' levels.
+        inverse: [n, 2, 2] px of the patch per px of the image, each at its pyramid level.
+        side: side of the warped patches, px.
+
+    Returns:
+        [n, side, side] gray values.
     """
     result = np.empty((len(patches), side * side), dtype=np.float32)
     patch_px = patches.shape[-1]
-    for start in range(0, len(patches), _AT_ONCE):
-        some = slice(start, start + _AT_ONCE)
-        column = patches[some].reshape(-1, patch_px).astype(np.float32)  # one patch below the other
-        places = inverse[some].astype(np.float32) @ patch_grid(side) + np.float32(
+    for start in range(0, len(patches), _PATCHES_PER_CALL):
+        batch = slice(start, start + _PATCHES_PER_CALL)
+        column = (
+            patches[batch].reshape(-1, patch_px).astype(np.float32)
+        )  # patches stacked vertically
+        positions = inverse[batch].astype(np.float32) @ patch_grid(side) + np.float32(
             (patch_px - 1) / 2
         )
-        x, y = np.clip(places, 0, patch_px - 1).transpose(1, 0, 2)
+        x, y = np.clip(positions, 0, patch_px - 1).transpose(1, 0, 2)
         y += patch_px * np.arange(len(y), dtype=np.float32)[:, None]
-        result[some] = cv2.remap(column, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        result[batch] = cv2.remap(column, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return result.reshape(-1, side, side)
 
 
@@ -77,12 +92,20 @@ def align(
     template: Floats,
     config: RefinementConfig,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Minimise eq. 8 over each pixel by inverse composition; image and patch may differ in
-    brightness and contrast.
+    """Align patches with an image around given pixels (eq. 8, inverse compositional).
 
-    pixels: [n, 2] px; template: [n, side + 2, side + 2], the patch with one px around it for its
-    gradient. Returns [n, 2] shifts, px of each one's level, and [n] bool: False where the patch has
-    no texture, leaves its surroundings, or does not look alike.
+    Differences in brightness and contrast are compensated.
+
+    Args:
+        pyramid: of the image.
+        pixels: [n, 2] initial positions, px of level 0.
+        octaves: [n] pyramid level of each patch.
+        template: [n, side + 2, side + 2] warped patches with a border of one px for the gradient.
+        config: limits of the alignment.
+
+    Returns:
+        [n, 2] shifts, px of each patch's level, and [n] bool: False where a patch has no texture,
+        shifts too far, or does not correlate with the image.
     """
     n = len(pixels)
     inner = _centered(template[:, 1:-1, 1:-1])
@@ -93,29 +116,29 @@ def align(
     H = (gradient @ gradient.transpose(0, 2, 1)).astype(np.float64) + 1e-3 * np.eye(2)
     active = _least_eigenvalue(H) > config.min_eigenvalue
     descent = np.linalg.inv(H).astype(np.float32) @ gradient
-    shift, likeness, side = np.zeros((n, 2)), np.zeros(n), template.shape[1] - 2
+    shift, correlation, side = np.zeros((n, 2)), np.zeros(n), template.shape[1] - 2
     for _ in range(config.max_iterations):
         rows = np.flatnonzero(active)
         if len(rows) == 0:
             break
-        seen = _centered(pyramid.cut(pixels[rows], octaves[rows], side, shift[rows]))
-        wanted = inner[rows]
-        seen *= contrast[rows] / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-6)
-        likeness[rows] = np.einsum("nk,nk->n", seen, wanted) / contrast[rows, 0] ** 2
-        step = (descent[rows] @ (wanted - seen)[..., None])[..., 0]
+        sampled = _centered(pyramid.cut(pixels[rows], octaves[rows], side, shift[rows]))
+        expected = inner[rows]
+        sampled *= contrast[rows] / np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), 1e-6)
+        correlation[rows] = np.einsum("nk,nk->n", sampled, expected) / contrast[rows, 0] ** 2
+        step = (descent[rows] @ (expected - sampled)[..., None])[..., 0]
         shift[rows] += step
         active[rows] = np.abs(step).max(axis=1) > config.epsilon_px
-    looks_alike = likeness >= config.min_correlation
-    return shift, looks_alike & (np.linalg.norm(shift, axis=1) <= config.max_shift_px)
+    is_correlated = correlation >= config.min_correlation
+    return shift, is_correlated & (np.linalg.norm(shift, axis=1) <= config.max_shift_px)
 
 
 def _least_eigenvalue(H: Array) -> Array:
-    """[n] of symmetric matrices [n, 2, 2]."""
+    """Return the smaller eigenvalue [n] of symmetric matrices [n, 2, 2]."""
     mean, half = (H[:, 0, 0] + H[:, 1, 1]) / 2, (H[:, 0, 0] - H[:, 1, 1]) / 2
     return np.asarray(mean - np.hypot(half, H[:, 0, 1]))
 
 
 def _centered(patches: Floats) -> Floats:
-    """[n, k]: every patch without its mean."""
+    """Flatten patches to [n, k], and subtract the mean of each."""
     flat = patches.reshape(len(patches), -1)
     return np.asarray(flat - flat.mean(axis=1, keepdims=True), dtype=np.float32)

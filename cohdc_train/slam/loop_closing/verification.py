@@ -11,8 +11,9 @@ from cohdc_train.slam.features.keypoints import Features
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.geometry.depth_image import DepthImage
 from cohdc_train.slam.geometry.se3 import Array, inverse
-from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations_at
 from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.mapping.projection import project_points
 from cohdc_train.slam.optimization.image_alignment import align
 from cohdc_train.slam.optimization.pose import optimize_pose
 from cohdc_train.slam.optimization.ransac import ransac_pose
@@ -118,9 +119,9 @@ class LoopVerifier:
             return None
         num_inliers = 0
         for radius in (config.radius_rough_px, config.radius_px):
-            projected = point_map.project(place, T_cw)
+            projected = project_points(point_map, place, T_cw)
             matches = match_projected(projected, features, radius, self._matching)
-            observed = observations(features, matches.keypoints)
+            observed = observations_at(features, matches.keypoints)
             points = point_map.positions[matches.point_ids]
             T_cw, inlier = optimize_pose(T_cw, points, observed, self._reprojection)
             num_inliers = int(inlier.sum())
@@ -130,7 +131,7 @@ class LoopVerifier:
         """Estimate a pose T_cw [4, 4] from descriptor matches alone, or return None."""
         config = self._config
         points = self._map.positions[matches.point_ids]
-        observed = observations(features, matches.keypoints)
+        observed = observations_at(features, matches.keypoints)
         if len(matches) < config.min_inliers_rough:
             return None
         found = ransac_pose(

@@ -1,1 +1,1 @@
-"""The map of keyframes and points, and its upkeep."""
+"""Map of keyframes and points, and its maintenance."""

@@ -1,9 +1,9 @@
-"""Local bundle adjustment beside tracking, so that tracking never waits for it.
+"""Local bundle adjustment in parallel with tracking.
 
-No two threads ever touch the map. The tracker's thread takes arrays out of it (`open_window`), a
-worker process does the sums on its own copy, and the tracker's thread, between two frames, puts the
-result in (`close_window`). One window is under way at a time; a keyframe that joins meanwhile
-waits, and a newer one takes its place.
+Only the tracker's thread accesses the map. It copies arrays from the map (`build_window`), a worker
+process adjusts the copy, and between two frames the tracker's thread writes the result
+(`apply_solution`). One window is adjusted at a time; a keyframe that is inserted meanwhile waits,
+and a newer one replaces it.
 """
 
 from concurrent.futures import Executor, Future
@@ -25,7 +25,7 @@ from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
 
 class BackgroundMapper:
-    """Bundle adjustments, one after the other, in an executor."""
+    """Queue of bundle adjustments that run in an executor, one after the other."""
 
     def __init__(
         self, executor: Executor, reprojection: ReprojectionModel, config: BundleAdjustmentConfig
@@ -38,7 +38,7 @@ class BackgroundMapper:
 
     @property
     def busy_with(self) -> set[int]:
-        """Indices of the keyframes that must stay in the map until `collect` has had them."""
+        """Return the indices of the keyframes that must stay in the map until `collect` returns."""
         waiting = set() if self._waiting is None else {self._waiting.index}
         return (
             waiting
@@ -47,7 +47,7 @@ class BackgroundMapper:
         )
 
     def start(self, point_map: Map, keyframe: Keyframe) -> None:
-        """Adjust the keyframe's window as soon as the one under way is done."""
+        """Adjust the keyframe's window as soon as the running adjustment is done."""
         if self._running is not None:
             self._waiting = keyframe
             return
@@ -58,8 +58,9 @@ class BackgroundMapper:
         self._running = window, job
 
     def collect(self, point_map: Map) -> Array | None:
-        """Put a finished result into the map. Returns the motion of `close_window`, None when there
-        is none.
+        """Write a finished result into the map.
+
+        Returns the motion of `apply_solution`, None where nothing has finished.
         """
         if self._running is None or not self._running[1].done():
             return None
@@ -72,7 +73,7 @@ class BackgroundMapper:
         return motion
 
     def finish(self, point_map: Map) -> None:
-        """Wait for what is under way and what waits, and put it into the map."""
+        """Wait for the running and the waiting adjustment, and write them into the map."""
         while self._running is not None:
             self._running[1].result()
             self.collect(point_map)

@@ -1,4 +1,4 @@
-"""Poses of all tracked frames, relative to keyframes, which mapping may move later."""
+"""Poses of all tracked frames, stored relative to keyframes that mapping may move later."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,11 +12,11 @@ from cohdc_train.slam.optimization.trajectory_smoothing import TrackedPoses
 
 
 class _Logged(NamedTuple):
-    """One frame.
+    """Stored frame.
 
-    timestamp: s; reference: index of its reference keyframe; relative: [4, 4] from that keyframe's
-    camera to the frame's, m; information: [6, 6] inverse covariance of the pose; prior_gradient:
-    [6] of the motion prior at the pose.
+    timestamp: s; reference: index of its reference keyframe; relative: [4, 4] camera of that
+    keyframe to camera of the frame, m; information: [6, 6] inverse covariance of the pose;
+    prior_gradient: [6] gradient of the motion prior at the pose.
     """
 
     timestamp: float
@@ -27,7 +27,7 @@ class _Logged(NamedTuple):
 
 
 class FrameHistory:
-    """Tracked frames of a run, in the order of time."""
+    """Tracked frames of a run, in order of time."""
 
     def __init__(self) -> None:
         self._frames: list[_Logged] = []
@@ -41,10 +41,15 @@ class FrameHistory:
         prior_gradient: Array,
         point_map: Map,
     ) -> int:
-        """Append the frame at a timestamp, s. Returns its row.
+        """Append a tracked frame, and return its row.
 
-        T_cw: [4, 4] world to camera, m; reference: the keyframe it stays relative to; information,
-        prior_gradient: as `_Logged`.
+        Args:
+            timestamp: s.
+            T_cw: [4, 4] world to camera, m.
+            reference: keyframe that the pose is stored relative to.
+            information: [6, 6] inverse covariance of the pose by the frame's measurements.
+            prior_gradient: [6] gradient of the motion prior at the pose.
+            point_map: the map, which has the keyframe's pose.
         """
         if reference is None:
             raise ValueError(f"frame at {timestamp:.6f} s has no reference keyframe")
@@ -56,13 +61,13 @@ class FrameHistory:
 
     @property
     def timestamps(self) -> Array:
-        """[n] s."""
+        """Return the timestamps [n] s."""
         return np.array([frame.timestamp for frame in self._frames])
 
     def poses(self, point_map: Map) -> Array:
-        """Return poses [n, 4, 4] T_cw world to camera, m, as the map has them now.
+        """Return the poses [n, 4, 4] T_cw, world to camera, m, in the current map.
 
-        Each frame is re-derived from its reference keyframe, or from that one's successor.
+        Each pose is computed from its reference keyframe, or from that keyframe's successor.
         """
         references = [frame.reference for frame in self._frames]
         keyframes = {index: point_map.pose(index) for index in set(references)}
@@ -70,7 +75,7 @@ class FrameHistory:
         return np.stack(poses) if poses else np.zeros((0, 4, 4))
 
     def update_poses(self, point_map: Map, rows: Sequence[int], poses: Array) -> None:
-        """The frames in rows [m] are at poses [m, 4, 4] T_cw, m, in the map as it is now."""
+        """Set the poses [m, 4, 4] T_cw, m, of the frames in rows [m], in the current map."""
         for row, pose in zip(rows, poses, strict=True):
             frame = self._frames[row]
             self._frames[row] = frame._replace(
@@ -78,7 +83,7 @@ class FrameHistory:
             )
 
     def tracked_poses(self, point_map: Map) -> TrackedPoses:
-        """Return all frames for smoothing, with poses as the map has them now."""
+        """Return all frames for smoothing, with their poses in the current map."""
         information = [frame.information for frame in self._frames]
         gradients = [frame.prior_gradient for frame in self._frames]
         return TrackedPoses(

@@ -1,4 +1,4 @@
-"""Keyframe: a pose, its features, and the map points that it observes."""
+"""Keyframe with its pose, its features, and the map points that it observes."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,11 @@ from cohdc_train.slam.optimization.reprojection import Observations
 
 @dataclass(eq=False)
 class Keyframe:
-    """Frame that the map keeps, with the points it observes.
+    """Frame in the map, with the points that it observes.
 
-    index: its number, not used again; timestamp: s; T_cw: [4, 4] world to camera,
-    m; point_ids: [n] int64, the map point of every keypoint or -1; thumbnail: [h, w] float32, zero
-    mean and unit norm, for relocalization; min_depth_grid: [h, w] m, as
-    FreeSpaceChecker.min_depth_grid gives it.
+    index: unique number; timestamp: s; T_cw: [4, 4] world to camera, m; point_ids: [n] int64, map
+    point of each keypoint or -1; thumbnail: [h, w] float32, zero mean and unit norm, for
+    relocalization; min_depth_grid: [h, w] m, of FreeSpaceChecker.min_depth_grid.
     """
 
     index: int
@@ -29,16 +28,16 @@ class Keyframe:
     min_depth_grid: NDArray[np.float32]
 
     def observed_point_ids(self) -> NDArray[np.int64]:
-        """Ids of the points this keyframe sees."""
+        """Return the ids of the points that the keyframe observes."""
         return self.point_ids[self.point_ids >= 0]
 
     def center(self) -> Array:
-        """[3] position of the camera in the world, m."""
+        """Return the position [3] of the camera in the world, m."""
         return np.asarray(-self.T_cw[:3, :3].T @ self.T_cw[:3, 3])
 
 
-def observations(features: Features, keypoints: NDArray[np.int64]) -> Observations:
-    """Return what a frame measured at some of its keypoints."""
+def observations_at(features: Features, keypoints: NDArray[np.int64]) -> Observations:
+    """Return the measurements of a frame at the chosen keypoints [m]."""
     sigmas, depth_sigmas = features.sigmas[keypoints], features.scales[keypoints]
     return Observations(
         features.undistorted[keypoints], features.depths[keypoints], sigmas, depth_sigmas

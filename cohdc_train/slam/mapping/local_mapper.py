@@ -1,4 +1,4 @@
-"""Insertion of keyframes, and the upkeep of the map after it."""
+"""Insertion of keyframes, followed by local bundle adjustment, loop closing, and culling."""
 
 from collections import deque
 from collections.abc import Callable
@@ -21,7 +21,10 @@ from cohdc_train.slam.optimization.reprojection import ReprojectionModel
 
 @dataclass(frozen=True)
 class LocalMapperConfig:
-    """Options of a local mapper. max_depth_m: farthest depth at which a point is created, m."""
+    """Options of a local mapper.
+
+    max_depth_m: farthest depth at which a point is created, m.
+    """
 
     bundle_adjustment: BundleAdjustmentConfig
     keyframe_culling: KeyframeCullingConfig
@@ -29,28 +32,31 @@ class LocalMapperConfig:
 
 
 class LoopCloserLike(Protocol):
-    """Closer of loops among the keyframes of a map."""
+    """Interface of a loop closer.
+
+    closed: number of loops closed; image_px: longer side of the image that it needs, px.
+    """
 
     closed: int
     image_px: int
 
     @property
     def loop_keyframes(self) -> set[int]:
-        """Indices of the keyframes that loops refer to."""
+        """Return the indices of the keyframes that loops refer to."""
 
     def close(self, keyframe: Keyframe, image: DepthImage) -> None:
-        """Look for a loop with the newest keyframe. The map may move."""
+        """Search a loop with the newest keyframe; the map may move."""
 
     def forget(self, keyframe: Keyframe) -> None:
-        """Forget a keyframe that the map gave up."""
+        """Forget a keyframe that the map has removed."""
 
 
 class LocalMapper:
-    """Insertion of keyframes into a map, and the upkeep that follows.
+    """Insertion of keyframes into a map, and the tasks that follow.
 
-    refiner: stores the patches of new points; loop_closer: looks for a loop with every keyframe,
-    None closes none; executor: runs bundle adjustment in parallel with tracking, None waits for it;
-    incremental: what can wait is left to `run_next_task`.
+    refiner: stores the patches of new points; loop_closer: searches a loop with every keyframe,
+    None disables loop closing; executor: runs bundle adjustment in parallel with tracking, None
+    runs it directly; incremental: leave the tasks after an insertion to `run_next_task`.
     """
 
     def __init__(
@@ -77,12 +83,12 @@ class LocalMapper:
 
     @property
     def num_loops(self) -> int:
-        """Loops closed so far."""
+        """Return the number of loops closed so far."""
         return 0 if self._loops is None else self._loops.closed
 
     @property
     def is_idle(self) -> bool:
-        """Whether all tasks of the latest keyframe are done."""
+        """Return whether all tasks of the latest keyframe are done."""
         return not self._tasks
 
     def insert(
@@ -90,10 +96,13 @@ class LocalMapper:
     ) -> None:
         """Insert a tracked keyframe, and create points at its keypoints with depth.
 
-        Then: duplicates fused, bundle adjustment, weak points removed; loops, redundant keyframes
-        removed. patches: image pyramid for the refiner; make_image: makes the image for loop
-        closing, whose longer side it is given in px. Tasks left of the keyframe before are finished
-        first.
+        The tasks that follow are fusion of duplicates, bundle adjustment, and point culling, then
+        loop closing and keyframe culling. Unfinished tasks of the keyframe before are run first.
+
+        Args:
+            keyframe: the frame, with the points that were tracked in it.
+            patches: image pyramid for the refiner.
+            make_image: makes the image for loop closing, whose longer side it is given in px.
         """
         self._run_all_tasks()
         self._map.add_keyframe(keyframe)
@@ -101,18 +110,21 @@ class LocalMapper:
         if self._refiner is not None and patches is not None:
             self._refiner.store(keyframe, patches)
         self._tasks.extend(
-            [lambda: self._settle(keyframe), lambda: self._look_back(keyframe, make_image)]
+            [
+                lambda: self._adjust(keyframe),
+                lambda: self._close_loops_and_cull(keyframe, make_image),
+            ]
         )
         if not self._incremental:
             self._run_all_tasks()
 
     def run_next_task(self) -> None:
-        """Run the next task, if any. Keyframes may move."""
+        """Run the next task, if there is one; keyframes may move."""
         if self._tasks:
             self._tasks.popleft()()
 
     def apply_finished_adjustment(self) -> None:
-        """Apply a bundle adjustment that has finished in parallel. Keyframes may move."""
+        """Apply a bundle adjustment that has finished in parallel; keyframes may move."""
         if self._mapper is not None:
             self._mapper.collect(self._map)
 
@@ -126,7 +138,8 @@ class LocalMapper:
         while self._tasks:
             self.run_next_task()
 
-    def _settle(self, keyframe: Keyframe) -> None:
+    def _adjust(self, keyframe: Keyframe) -> None:
+        """Fuse duplicates of a keyframe's points, bundle-adjust its window, and cull points."""
         if len(self._map.keyframes) == 1:
             return
         fuse(self._map, keyframe)
@@ -137,7 +150,10 @@ class LocalMapper:
             self._mapper.start(self._map, keyframe)
         cull_map_points(self._map, keyframe.index)
 
-    def _look_back(self, keyframe: Keyframe, make_image: Callable[[int], DepthImage]) -> None:
+    def _close_loops_and_cull(
+        self, keyframe: Keyframe, make_image: Callable[[int], DepthImage]
+    ) -> None:
+        """Search a loop with a keyframe, and cull redundant keyframes."""
         in_use: set[int] = set() if self._mapper is None else self._mapper.busy_with
         if self._loops is not None:
             self._loops.close(keyframe, make_image(self._loops.image_px))

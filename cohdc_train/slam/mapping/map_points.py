@@ -6,24 +6,25 @@ from numpy.typing import NDArray
 from cohdc_train.slam.features.matching import match_projected
 from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.mapping.projection import project_points
 
 
 def add_points(point_map: Map, keyframe: Keyframe, max_depth_m: float) -> None:
-    """Create a point for every keypoint with usable depth that belongs to none."""
+    """Create a point for every keypoint with usable depth that has none."""
     features = keyframe.features
     usable = (keyframe.point_ids < 0) & (features.depths <= max_depth_m)  # nan compares False
     point_map.add_points(keyframe, np.flatnonzero(usable))
 
 
 def fuse(point_map: Map, keyframe: Keyframe) -> None:
-    """Search the keyframe's points in its neighbors; duplicates are fused into the older point."""
+    """Match a keyframe's points into covisible keyframes, and merge duplicates."""
     ids = keyframe.observed_point_ids()
     neighbors = [
         k
         for k in point_map.covisible(ids, point_map.config.fuse_keyframes + 1)
         if k is not keyframe
     ]
-    pairs = [_look_for(point_map, ids, other) for other in neighbors]
+    pairs = [_match_into(point_map, ids, other) for other in neighbors]
     if pairs:
         _merge(point_map, np.concatenate(pairs, axis=1), [keyframe, *neighbors])
 
@@ -31,17 +32,21 @@ def fuse(point_map: Map, keyframe: Keyframe) -> None:
 def fuse_into(
     point_map: Map, ids: NDArray[np.int64], other: Keyframe, keyframes: list[Keyframe]
 ) -> None:
-    """Search points in another keyframe. keyframes: all that may observe duplicates."""
-    _merge(point_map, _look_for(point_map, ids, other), keyframes)
+    """Match points into another keyframe, and merge duplicates.
+
+    keyframes: all keyframes that may observe duplicates.
+    """
+    _merge(point_map, _match_into(point_map, ids, other), keyframes)
 
 
-def _look_for(point_map: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np.int64]:
-    """Search points in one keyframe, and match them with its free keypoints.
+def _match_into(point_map: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArray[np.int64]:
+    """Project points into a keyframe, and match them with its keypoints.
 
-    Returns [2, k] points whose keypoints belong to other points, and these.
+    Keypoints without a point get one. Returns [2, k] pairs of a point and of the point that its
+    keypoint already has.
     """
     config = point_map.config
-    projected = point_map.project(point_map.unseen(ids, other), other.T_cw)
+    projected = project_points(point_map, point_map.unseen(ids, other), other.T_cw)
     matches = match_projected(
         projected,
         other.features,
@@ -55,20 +60,20 @@ def _look_for(point_map: Map, ids: NDArray[np.int64], other: Keyframe) -> NDArra
 
 
 def _merge(point_map: Map, pairs: NDArray[np.int64], keyframes: list[Keyframe]) -> None:
-    """Fuse pairs [2, k] of points that look alike where they are close to each other."""
+    """Merge pairs [2, k] of points with similar descriptors where they are close to each other."""
     distance = np.linalg.norm(point_map.positions[pairs[0]] - point_map.positions[pairs[1]], axis=1)
     first, second = pairs[:, distance < point_map.config.fuse_distance_m]
     if len(first) == 0:
         return
-    later = point_map.first_keyframe[first] - point_map.first_keyframe[second]
-    older = np.where(
-        later == 0, first < second, later < 0
-    )  # one order of all points, so that no two swap places
+    age = point_map.first_keyframe[first] - point_map.first_keyframe[second]
+    # A total order of the points, so that no two replace each other.
+    older = np.where(age == 0, first < second, age < 0)
     old, new = np.where(older, second, first), np.where(older, first, second)
-    gives_way = np.zeros(point_map.size, dtype=np.bool_)
-    gives_way[old] = True
-    stays = ~gives_way[new]  # a point that itself gives way this time waits for the next keyframe
-    point_map.replace(old[stays], new[stays], keyframes)
+    is_replaced = np.zeros(point_map.size, dtype=np.bool_)
+    is_replaced[old] = True
+    # A point that is itself replaced receives no other until the next keyframe.
+    can_merge = ~is_replaced[new]
+    point_map.replace(old[can_merge], new[can_merge], keyframes)
 
 
 def cull_map_points(point_map: Map, newest: int) -> None:

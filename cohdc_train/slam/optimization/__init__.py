@@ -1,1 +1,1 @@
-"""Least squares over poses, points and images."""
+"""Nonlinear least squares over poses, points, and images."""

@@ -1,6 +1,4 @@
-"""Bundle adjustment: Levenberg-Marquardt over poses and points, points eliminated by the Schur
-complement.
-"""
+"""Bundle adjustment by Levenberg-Marquardt, with points eliminated by the Schur complement."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -24,44 +22,44 @@ from cohdc_train.slam.optimization.reprojection import (
 
 @dataclass(frozen=True)
 class Problem:
-    """Observations of points by cameras, no point twice by one camera.
+    """Observations of points by cameras; a camera observes a point at most once.
 
-    cameras: [m] int64 index into the poses, sorted; points: [m] int64 index into the points; seen:
-    the m measurements;
-    free: [c] bool, which poses may move.
+    cameras: [m] int64 index into the poses, sorted; points: [m] int64 index into the points;
+    observations: the m measurements; free: [c] bool, True = the pose is optimized.
     """
 
     cameras: NDArray[np.int64]
     points: NDArray[np.int64]
-    seen: Observations
+    observations: Observations
     free: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
-        if not len(self.cameras) == len(self.points) == len(self.seen):
+        if not len(self.cameras) == len(self.points) == len(self.observations):
             raise ValueError("cameras, points and measurements differ in length")
         if np.any(np.diff(self.cameras) < 0):
             raise ValueError("measurements must be sorted by camera")
 
     def take(self, rows: NDArray[np.bool_]) -> "Problem":
-        """The same problem with the chosen measurements only."""
-        return Problem(self.cameras[rows], self.points[rows], self.seen.take(rows), self.free)
+        """Return the problem with the chosen measurements [m] bool only."""
+        return Problem(
+            self.cameras[rows], self.points[rows], self.observations.take(rows), self.free
+        )
 
 
 @dataclass(frozen=True)
 class _Normal:
-    """Blocks of the normal equations of c free cameras and p points, after weighing."""
+    """Blocks of the weighted normal equations of c free cameras and p points."""
 
     camera: Array  # [c, 6, 6]
     point: Array  # [p, 3, 3]
-    mixed: (
-        sparse.bsr_array
-    )  # [c * 6, p * 3]: a block of 6 x 3 for every measurement by a free camera
+    # [c * 6, p * 3]: a block of 6 x 3 for every measurement by a free camera.
+    mixed: sparse.bsr_array
     camera_gradient: Array  # [c, 6]
     point_gradient: Array  # [p, 3]
 
 
 def local_points(poses: Array, points: Array, problem: Problem) -> Array:
-    """[m, 3] each measured point in the frame of the camera that saw it, m."""
+    """Transform each observed point into the frame of its camera; returns [m, 3] m."""
     result = np.empty((len(problem.points), 3))
     ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
     for camera, pose in enumerate(poses):
@@ -73,9 +71,9 @@ def local_points(poses: Array, points: Array, problem: Problem) -> Array:
 def measurement_chi2(
     poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel
 ) -> Array:
-    """[m] squared residual in sigmas; infinite where the point lies behind the camera."""
+    """Return the chi-square [m] of each measurement, infinite for a point behind its camera."""
     local = local_points(poses, points, problem)
-    error = residuals(local, problem.seen, reprojection)
+    error = residuals(local, problem.observations, reprojection)
     return np.where(local[:, 2] > MIN_DEPTH_M, np.einsum("mi,mi->m", error, error), np.inf)
 
 
@@ -87,11 +85,21 @@ def adjust(
     steps: int = 8,
     robust: bool = True,
 ) -> tuple[Array, Array]:
-    """Minimise the (Huber) cost of all measurements over the free poses and all points.
+    """Minimize the (Huber) cost of all measurements over the free poses and all points.
 
-    poses: [c, 4, 4] T_cw; points: [p, 3] world, m. Returns both, improved; the cost never rises. At
-    least one pose must be fixed, or depth measured, for the problem to have one answer; damping
-    keeps the step finite in any case.
+    At least one pose must be fixed, or depth measured, for a unique solution; damping keeps the
+    step finite in any case.
+
+    Args:
+        poses: [c, 4, 4] T_cw, world to camera, m.
+        points: [p, 3] world, m.
+        problem: the measurements, and which poses are free.
+        reprojection: camera model of the measurements.
+        steps: Levenberg-Marquardt steps at most.
+        robust: use the Huber kernel.
+
+    Returns:
+        The optimized poses and points; the cost is never higher than before.
     """
     damping = 1e-4
     cost = _cost(poses, points, problem, reprojection, robust)
@@ -115,23 +123,25 @@ def adjust(
 def _cost(
     poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, robust: bool
 ) -> float:
-    error = residuals(local_points(poses, points, problem), problem.seen, reprojection)
+    """Return the sum of the squared residuals, with the Huber kernel where robust."""
+    error = residuals(local_points(poses, points, problem), problem.observations, reprojection)
     chi2 = np.einsum("mi,mi->m", error, error)
     if not robust:
         return float(chi2.sum())
-    limits = problem.seen.chi2_thresholds
+    limits = problem.observations.chi2_thresholds
     return float(np.where(chi2 <= limits, chi2, 2 * np.sqrt(limits * chi2) - limits).sum())
 
 
 def _normal_equations(
     poses: Array, points: Array, problem: Problem, reprojection: ReprojectionModel, robust: bool
 ) -> _Normal:
+    """Build the blocks of the normal equations at the current poses and points."""
     local = local_points(poses, points, problem)
-    error = residuals(local, problem.seen, reprojection)
-    derivative = residual_jacobian(local, problem.seen, reprojection)
+    error = residuals(local, problem.observations, reprojection)
+    derivative = residual_jacobian(local, problem.observations, reprojection)
     if robust:
         weight = np.sqrt(
-            huber_weights(np.einsum("mi,mi->m", error, error), problem.seen.chi2_thresholds)
+            huber_weights(np.einsum("mi,mi->m", error, error), problem.observations.chi2_thresholds)
         )
         error, derivative = error * weight[:, None], derivative * weight[:, None, None]
     by_pose = pose_jacobian(local, derivative)
@@ -141,10 +151,8 @@ def _normal_equations(
     point, point_gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
     ends = np.searchsorted(problem.cameras, np.arange(len(poses) + 1))
     for rows in (slice(*pair) for pair in pairwise(ends)):
-        ids, J = (
-            problem.points[rows],
-            by_point[rows],
-        )  # a camera sees a point once, so += may index with an array
+        # A camera observes a point once, so that += may index with an array.
+        ids, J = problem.points[rows], by_point[rows]
         point[ids] += J.transpose(0, 2, 1) @ J
         point_gradient[ids] += np.einsum("mij,mi->mj", J, error[rows])
     for slot, index in enumerate(free):
@@ -162,17 +170,17 @@ def _normal_equations(
 
 
 def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
-    """Steps of the poses [c, 6] and the points [p, 3] from the damped normal equations."""
+    """Solve the damped normal equations for the steps of poses [c, 6] and points [p, 3]."""
     c, mixed = len(normal.camera), normal.mixed
     diagonal = np.arange(3)
     point = normal.point.copy()
     point[:, diagonal, diagonal] = point[:, diagonal, diagonal] * (1 + damping) + 1e-6
     inverse = np.linalg.inv(point)
     blocks = mixed.data @ inverse[mixed.indices]
-    carried = sparse.bsr_array((blocks, mixed.indices, mixed.indptr), shape=mixed.shape)
+    reduced = sparse.bsr_array((blocks, mixed.indices, mixed.indptr), shape=mixed.shape)
     camera = normal.camera + (damping * normal.camera + 1e-9) * np.eye(6)
     cameras = sparse.bsr_array((camera, np.arange(c), np.arange(c + 1)))
-    right = carried @ normal.point_gradient.ravel() - normal.camera_gradient.ravel()
-    pose_step = solve_symmetric(cameras - carried @ mixed.T, right)
-    back = -normal.point_gradient - (mixed.T @ pose_step).reshape(-1, 3)
-    return pose_step.reshape(c, 6), np.einsum("pij,pj->pi", inverse, back)
+    rhs = reduced @ normal.point_gradient.ravel() - normal.camera_gradient.ravel()
+    pose_step = solve_symmetric(cameras - reduced @ mixed.T, rhs)
+    point_rhs = -normal.point_gradient - (mixed.T @ pose_step).reshape(-1, 3)
+    return pose_step.reshape(c, 6), np.einsum("pij,pj->pi", inverse, point_rhs)

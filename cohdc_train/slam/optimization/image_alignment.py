@@ -1,15 +1,15 @@
-"""Inverse compositional alignment of a local image to the map's (paper section 2.3, equations 10
-to 12).
+"""Inverse compositional alignment of a local image with a map image (paper eqs. 10 to 12).
 
-Where this departs from the paper:
-- its warp is a euclidean motion (x, y, theta) of whole map images. Images of a room have
-  parallax, so that such a motion has no metric meaning; here the warp W(x; p) carries a pixel x of
-  the map's image, through its measured depth, by a rigid motion p of six parameters into the
-  local image;
-- equation 11 squares the residual and leaves out the transpose: misprints, for a squared residual
-  has no sign. The step of Gauss-Newton is H^-1 times the sum of steepest-descent^T times the
-  residual;
-- equation 12 adds the step to p; motions do not add, so W is composed with the inverse of the step.
+The implementation departs from section 2.3 of the paper in three points:
+
+- The paper's warp is a Euclidean motion (x, y, theta) of whole map images. Images of a room have
+  parallax, so that such a motion has no metric meaning. Here the warp W(x; p) transforms a pixel x
+  of the map image, with its measured depth, by a rigid motion p of six parameters into the local
+  image.
+- Equation 11 squares the residual and lacks the transpose, both misprints, since a squared residual
+  has no sign. The Gauss-Newton step is H^-1 times the sum of steepest-descent^T times the residual.
+- Equation 12 adds the step to p. Rigid motions do not add, so that W is composed with the inverse
+  of the step.
 """
 
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ from cohdc_train.slam.optimization.reprojection import MIN_DEPTH_M
 class Alignment:
     """Result of aligning two images.
 
-    T: [4, 4] camera of the map's image to camera of the local one, m; before, after: mean clipped
-    photometric error, in standard deviations of the map's image; correlation: -1..1 of the two
-    images where both see the same;
-    overlap: share of the map's pixels that the local image sees at the depth they should have;
-    agreement: the same share of those pixels that fall on a depth reading at all.
+    T: [4, 4] camera of the map image to camera of the local image, m; before, after: mean clipped
+    photometric error, in standard deviations of the map image; correlation: -1..1, of the two
+    images where both show the same surface; overlap: share of the map image's pixels that the local
+    image shows at the expected depth; agreement: the same as a share of the pixels with a depth
+    reading.
     """
 
     T: Array
@@ -45,13 +45,20 @@ class Alignment:
 
 
 def align(
-    of_map: DepthImage, local: DepthImage, T: Array, config: LoopVerificationConfig
+    map_image: DepthImage, local: DepthImage, T: Array, config: LoopVerificationConfig
 ) -> Alignment | None:
-    """Refine T: [4, 4] camera of the map's image to camera of the local one, m; coarse to fine.
+    """Refine the relative pose of two images by photometric alignment, coarse to fine.
 
-    Returns None when the images hardly overlap or there is nothing to hold on to.
+    Args:
+        map_image: image of the map's keyframe.
+        local: image of the current keyframe.
+        T: [4, 4] initial transform, camera of the map image to camera of the local image, m.
+        config: levels, iterations, and limits.
+
+    Returns:
+        The alignment; None where the images share too few pixels.
     """
-    pairs = [(of_map, local)]
+    pairs = [(map_image, local)]
     for _ in range(config.levels - 1):
         pairs.append((pairs[-1][0].half(), pairs[-1][1].half()))
     levels = [(_Template(image, config), other) for image, other in pairs]
@@ -70,9 +77,10 @@ def align(
 
 
 class _Template:
-    """The map's image, with the steepest-descent image of its usable pixels."""
+    """Map image with the steepest-descent images of its usable pixels."""
 
     def __init__(self, image: DepthImage, config: LoopVerificationConfig) -> None:
+        """Select pixels away from depth edges, and compute their points and steepest descent."""
         camera, depth = image.camera, image.depth
         near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
         max_step = config.max_depth_step_ratio * depth
@@ -115,14 +123,14 @@ def warp_jacobian(points: Array, camera: Camera) -> Array:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """A template in a local image.
+    """Comparison of a template with a local image.
 
-    seen: [x] bool, which pixels both see; template, sampled: [s] their grey values in both, the
-    latter with the gain and offset of the former; residual: [s] clipped; error, overlap, agreement:
+    is_visible: [x] bool, pixels that both images show; template, sampled: [s] their gray values,
+    the latter with gain and offset of the former; residual: [s] clipped; error, overlap, agreement:
     as in Alignment.
     """
 
-    seen: NDArray[np.bool_]
+    is_visible: NDArray[np.bool_]
     template: Array
     sampled: Array
     residual: Array
@@ -134,29 +142,41 @@ class _Comparison:
 def _compare(
     template: _Template, local: DepthImage, T: Array, config: LoopVerificationConfig
 ) -> _Comparison | None:
-    carried = to_local(T, template.points)
-    z = np.maximum(carried[:, 2], MIN_DEPTH_M)
-    pixels = local.camera.project(np.column_stack([carried[:, :2], z]))
-    there = _sample(local.depth, pixels, cv2.INTER_NEAREST)
-    with_reading = there > 0
-    seen = np.asarray(with_reading & (np.abs(there - z) < config.same_depth_ratio * z))
-    if seen.sum() < config.min_pixels:
+    """Warp a template into the local image; None where too few pixels are visible in both."""
+    points = to_local(T, template.points)
+    z = np.maximum(points[:, 2], MIN_DEPTH_M)
+    pixels = local.camera.project(np.column_stack([points[:, :2], z]))
+    measured_depth = _sample(local.depth, pixels, cv2.INTER_NEAREST)
+    with_reading = measured_depth > 0
+    is_visible = np.asarray(
+        with_reading & (np.abs(measured_depth - z) < config.same_depth_ratio * z)
+    )
+    if is_visible.sum() < config.min_pixels:
         return None
-    sampled, values = _sample(local.gray, pixels[seen], cv2.INTER_LINEAR), template.values[seen]
+    sampled, values = (
+        _sample(local.gray, pixels[is_visible], cv2.INTER_LINEAR),
+        template.values[is_visible],
+    )
     spread = float(values.std()) + 1e-6
     sampled = (sampled - sampled.mean()) * (spread / (sampled.std() + 1e-6)) + values.mean()
     residual = sampled - values
     limit = config.clip_sigma * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
     error = float(np.minimum(np.abs(residual), spread).mean()) / spread
-    share = float(seen.sum())
+    num_visible = float(is_visible.sum())
     residual = np.clip(residual, -limit, limit)
     return _Comparison(
-        seen, values, sampled, residual, error, share / len(seen), share / float(with_reading.sum())
+        is_visible,
+        values,
+        sampled,
+        residual,
+        error,
+        num_visible / len(is_visible),
+        num_visible / float(with_reading.sum()),
     )
 
 
 def _sample(image: NDArray[np.float32], pixels: Array, interpolation: int) -> Array:
-    """[x] values at pixels [x, 2]; 0 outside."""
+    """Sample an image at pixels [x, 2]; returns [x], 0 outside the image."""
     x, y = (np.ascontiguousarray(pixels[None, :, axis], dtype=np.float32) for axis in (0, 1))
     found = cv2.remap(image, x, y, interpolation, borderValue=0)
     return np.asarray(found[0], dtype=np.float64)
@@ -165,16 +185,16 @@ def _sample(image: NDArray[np.float32], pixels: Array, interpolation: int) -> Ar
 def _align_level(
     template: _Template, local: DepthImage, T: Array, config: LoopVerificationConfig
 ) -> Array | None:
+    """Run Gauss-Newton on one level; returns T, or None where too few pixels are visible."""
     for _ in range(config.iterations):
-        now = _compare(template, local, T, config)
-        if now is None:
+        comparison = _compare(template, local, T, config)
+        if comparison is None:
             return None
-        descent = template.descent[now.seen]
+        descent = template.descent[comparison.is_visible]
         H = descent.T @ descent + 1e-9 * np.eye(6)  # equation 10
-        step = np.linalg.solve(
-            H, descent.T @ now.residual
-        )  # equation 11, see above; the residual is I_LM(W) - I_PM
+        # Equation 11 as in the module's docstring; the residual is I_LM(W) - I_PM.
+        step = np.linalg.solve(H, descent.T @ comparison.residual)
         T = T @ inverse(exp_se3(step))  # equation 12, composed
-        if np.abs(step).max() < 2e-5:  # 20 micrometres or microradians
+        if np.abs(step).max() < 2e-5:  # 20 micrometers or microradians
             break
     return T

@@ -8,9 +8,14 @@ from cohdc_train.slam.geometry.se3 import Array
 
 
 def solve_symmetric(matrix: sparse.sparray | sparse.spmatrix, right: Array) -> Array:
-    """Solve matrix @ x = right for x [n].
+    """Solve a sparse, symmetric, positive definite linear system.
 
-    matrix: sparse [n, n], symmetric and positive definite; right: [n].
+    Args:
+        matrix: sparse [n, n].
+        right: [n] right-hand side.
+
+    Returns:
+        x [n] of matrix @ x = right.
     """
     options = {"SymmetricMode": True}
     factors = splu(

@@ -1,8 +1,7 @@
-"""Pose-graph optimisation: keyframes as nodes, relative poses as edges, loops under a Cauchy
-kernel.
+"""Pose-graph optimization, with keyframes as nodes and a Cauchy kernel on loop edges.
 
-Own and sparse instead of gtsam: its wheel weighs 34 MB, more than the rest of the SLAM runner, and
-a graph of this size is solved in well under a second here.
+It is a sparse implementation of our own rather than gtsam, whose wheel of 34 MB is larger than the
+rest of the SLAM runner. A graph of this size is solved in well under a second.
 """
 
 from dataclasses import dataclass
@@ -25,11 +24,11 @@ from cohdc_train.slam.optimization.linear_solver import solve_symmetric
 
 @dataclass(frozen=True)
 class Edges:
-    """e measured relative poses.
+    """Measured relative poses, e of them.
 
     first, second: [e] int64 nodes; T: [e, 4, 4] camera of `first` to camera of `second`, m; sigmas:
-    [e, 2] standard deviation of (translation m, rotation rad); robust: [e] bool, whether the edge
-    may be wrong.
+    [e, 2] standard deviations of (translation m, rotation rad); robust: [e] bool, True = the edge
+    may be wrong and gets the Cauchy kernel.
     """
 
     first: NDArray[np.int64]
@@ -46,16 +45,18 @@ class Edges:
 
 
 def edge_errors(poses: Array, edges: Edges) -> Array:
-    """[e, 6] log of (the relative pose that the nodes have, times the inverse of the measured one),
-    in sigmas.
+    """Return the error [e, 6] of each edge in standard deviations.
+
+    It is the logarithm of the nodes' relative pose times the inverse of the measured one.
     """
-    has = poses[edges.second] @ inverse(poses[edges.first])
-    return log_se3(has @ inverse(edges.T)) / np.repeat(edges.sigmas, 3, axis=1)
+    relative = poses[edges.second] @ inverse(poses[edges.first])
+    return log_se3(relative @ inverse(edges.T)) / np.repeat(edges.sigmas, 3, axis=1)
 
 
 def edge_jacobians(poses: Array, edges: Edges) -> tuple[Array, Array]:
-    """d error / d xi of the first and of the second node, [e, 6, 6] each, to second order in the
-    error.
+    """Return the Jacobians [e, 6, 6] of the edge errors by xi of the first and of the second node.
+
+    They are exact to second order in the error.
     """
     scale = np.repeat(edges.sigmas, 3, axis=1)
     ad = adjoint_of_algebra(edge_errors(poses, edges) * scale)
@@ -65,12 +66,19 @@ def edge_jacobians(poses: Array, edges: Edges) -> tuple[Array, Array]:
 
 
 def optimize_graph(poses: Array, edges: Edges, config: LoopConfig) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on all poses but node 0, which holds still and must be connected with
-    every other.
+    """Optimize all poses but node 0 by Levenberg-Marquardt.
 
-    poses: [n, 4, 4] T_cw. The Cauchy kernel of the robust edges begins so wide that each has at
-    least half its weight and narrows to config.cauchy_width, so that a right loop pulls from the
-    start and a wrong one lets go. Returns the poses and [e] the final weight 0..1 of each edge.
+    Every node must be connected with node 0. The Cauchy kernel of the robust edges starts so wide
+    that each edge has at least half its weight, and narrows to config.cauchy_width. Correct loop
+    edges thus act from the start, and wrong ones lose their weight.
+
+    Args:
+        poses: [n, 4, 4] T_cw, world to camera, m.
+        edges: relative poses between the nodes.
+        config: width of the kernel, rounds, and steps.
+
+    Returns:
+        The optimized poses, and the final weight 0..1 [e] of each edge.
     """
     final = config.cauchy_width**2
     start = _squared(poses, edges)[edges.robust].max(initial=final)
@@ -80,37 +88,41 @@ def optimize_graph(poses: Array, edges: Edges, config: LoopConfig) -> tuple[Arra
 
 
 def _squared(poses: Array, edges: Edges) -> Array:
+    """Return the squared error [e] of each edge, in variances."""
     error = edge_errors(poses, edges)
     return np.asarray(np.einsum("ea,ea->e", error, error))
 
 
 def _weights(squared: Array, edges: Edges, width2: float) -> Array:
+    """Return the Cauchy weight [e] of each edge, 1 for edges that are not robust."""
     return np.where(edges.robust, 1 / (1 + squared / width2), 1.0)
 
 
 def _cost(squared: Array, edges: Edges, width2: float) -> float:
+    """Return the total cost, with the Cauchy kernel on robust edges."""
     return float(np.where(edges.robust, width2 * np.log1p(squared / width2), squared).sum())
 
 
 def _descend(poses: Array, edges: Edges, width2: float, steps: int) -> Array:
+    """Run damped Gauss-Newton steps with a fixed width of the kernel."""
     damping = 1e-6
     squared = _squared(poses, edges)
     for _ in range(steps):
         step = _solve(poses, edges, _weights(squared, edges, width2), damping)
         moved = poses.copy()
         moved[1:] = exp_se3(step) @ poses[1:]
-        new = _squared(moved, edges)
-        if _cost(new, edges, width2) > _cost(squared, edges, width2):
+        new_squared = _squared(moved, edges)
+        if _cost(new_squared, edges, width2) > _cost(squared, edges, width2):
             damping *= 100
             continue
-        poses, squared, damping = moved, new, damping / 10
-        if np.abs(step).max() < 1e-5:  # 10 micrometres or microradians
+        poses, squared, damping = moved, new_squared, damping / 10
+        if np.abs(step).max() < 1e-5:  # 10 micrometers or microradians
             break
     return poses
 
 
 def _solve(poses: Array, edges: Edges, weights: Array, damping: float) -> Array:
-    """[n - 1, 6] step of the nodes 1, 2, ..."""
+    """Solve the damped normal equations for the steps [n - 1, 6] of the nodes 1, 2, ..."""
     n, e = len(poses), len(edges.first)
     root = np.sqrt(weights)[:, None]
     blocks = [jacobian * root[..., None] for jacobian in edge_jacobians(poses, edges)]
@@ -120,9 +132,9 @@ def _solve(poses: Array, edges: Edges, weights: Array, damping: float) -> Array:
         for node in (edges.first, edges.second)
     ]
     values = np.concatenate([block.ravel() for block in blocks])
-    places = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
-    J = sparse.csc_matrix((values, places), shape=(e * 6, n * 6))[:, 6:]
+    indices = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
+    J = sparse.csc_matrix((values, indices), shape=(e * 6, n * 6))[:, 6:]
     H = J.T @ J
     H += sparse.diags(damping * H.diagonal() + 1e-9, format="csc")
-    right = -(J.T @ (edge_errors(poses, edges) * root).ravel())
-    return solve_symmetric(H, right).reshape(-1, 6)
+    rhs = -(J.T @ (edge_errors(poses, edges) * root).ravel())
+    return solve_symmetric(H, rhs).reshape(-1, 6)

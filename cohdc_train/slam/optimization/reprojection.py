@@ -10,14 +10,18 @@ from cohdc_train.slam.geometry.camera import Camera
 from cohdc_train.slam.geometry.se3 import Array, inverse, to_local
 
 CHI2_PIXEL = 5.991  # 95 % of a chi-square with two degrees of freedom
-CHI2_DEPTH = 7.815  # and with three: pixel and depth
+CHI2_DEPTH = 7.815  # the same with three: pixel and depth
 MIN_DEPTH_M = 0.05  # m: points nearer than this, or behind the camera, do not count
 
 
 @dataclass(frozen=True)
 class Observations:
-    """m measurements. pixels: [m, 2] undistorted px; depths: [m] m, nan = none; sigmas,
-    depth_sigmas: [m] px, of each coordinate and of the disparity that depth stands for."""
+    """Measurements of m points in one or several frames.
+
+    pixels: [m, 2] undistorted px; depths: [m] m, nan = none; sigmas: [m] standard deviation of each
+    pixel coordinate, px; depth_sigmas: [m] standard deviation of the disparity that depth stands
+    for, px.
+    """
 
     pixels: Array
     depths: Array
@@ -36,28 +40,24 @@ class Observations:
         return len(self.pixels)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Observations":
-        """The chosen rows."""
+        """Return the measurements of the chosen rows."""
         return Observations(
             self.pixels[rows], self.depths[rows], self.sigmas[rows], self.depth_sigmas[rows]
         )
 
-    def weighted(self, trust: Array) -> "Observations":
-        """The same of points that stand still with these probabilities, [m] above 0 up to 1: they
-        weigh as much.
-        """
-        share = np.sqrt(trust)
-        return Observations(
-            self.pixels, self.depths, self.sigmas / share, self.depth_sigmas / share
-        )
+    def weighted(self, probability: Array) -> "Observations":
+        """Weight each measurement by the probability [m] that its point is static, in (0, 1]."""
+        root = np.sqrt(probability)
+        return Observations(self.pixels, self.depths, self.sigmas / root, self.depth_sigmas / root)
 
     @property
     def chi2_thresholds(self) -> Array:
-        """[m] chi-square above which a measurement is an outlier at 5 %."""
+        """Return the chi-square [m] above which a measurement is an outlier at 5 %."""
         return np.where(np.isnan(self.depths), CHI2_PIXEL, CHI2_DEPTH)
 
 
 def concatenate(parts: list[Observations]) -> Observations:
-    """All measurements of some frames, in their order."""
+    """Concatenate the measurements of several frames, in order."""
     return Observations(
         np.concatenate([part.pixels for part in parts]),
         np.concatenate([part.depths for part in parts]),
@@ -68,8 +68,10 @@ def concatenate(parts: list[Observations]) -> Observations:
 
 @dataclass(frozen=True)
 class ReprojectionModel:
-    """The camera and bf, px m: how far depth is trusted. 100 px m is a sigma of 1 cm at 1 m and 9
-    cm at 3 m.
+    """Camera model of the measurements.
+
+    camera: intrinsics; bf: focal length times baseline, px m, which weights depth. 100 px m is a
+    standard deviation of 1 cm at 1 m and of 9 cm at 3 m.
     """
 
     camera: Camera
@@ -78,41 +80,53 @@ class ReprojectionModel:
 
 @dataclass(frozen=True)
 class Prior:
-    """A pose as it was expected. T_cw: [4, 4] world to camera, m; information: [6, 6] inverse
-    covariance of the small motion (m, rad) in the camera's frame that leads from it to the true
-    one."""
+    """Prior of a pose, such as the prediction of a motion model.
+
+    T_cw: [4, 4] world to camera, m; information: [6, 6] inverse covariance of the small motion (m,
+    rad) in the camera frame from this pose to the true one.
+    """
 
     T_cw: Array
     information: Array
 
     def gradient(self, T_cw: Array) -> Array:
-        """[6] gradient, at T_cw, of half the squared distance in sigmas; to first order in the
-        rotation between.
+        """Return the gradient [6], at T_cw, of half the squared Mahalanobis distance to the prior.
+
+        It is exact to first order in the rotation between the two poses.
         """
-        between = T_cw @ inverse(self.T_cw)
-        turn = np.asarray(cv2.Rodrigues(between[:3, :3])[0])[:, 0]
-        way = between[:3, 3] - 0.5 * np.cross(turn, between[:3, 3])
-        return np.asarray(self.information @ np.concatenate([way, turn]))
+        relative = T_cw @ inverse(self.T_cw)
+        rotation = np.asarray(cv2.Rodrigues(relative[:3, :3])[0])[:, 0]
+        translation = relative[:3, 3] - 0.5 * np.cross(rotation, relative[:3, 3])
+        return np.asarray(self.information @ np.concatenate([translation, rotation]))
 
 
-def residuals(local: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
-    """local: [m, 3] points in the camera frame, m. Returns [m, 3] prediction minus measurement, in
-    sigmas.
+def residuals(local: Array, observations: Observations, reprojection: ReprojectionModel) -> Array:
+    """Return the residuals of points: prediction minus measurement, in standard deviations.
+
+    Args:
+        local: [m, 3] points in the camera frame, m.
+        observations: the m measurements.
+        reprojection: camera model.
+
+    Returns:
+        [m, 3] of u, v, and disparity; the latter is 0 without depth.
     """
     camera = reprojection.camera
     z = np.maximum(local[:, 2], MIN_DEPTH_M)
-    result = np.empty((3, len(local))).T  # each residual's values side by side
-    result[:, 0] = camera.fx * local[:, 0] / z + camera.cx - seen.pixels[:, 0]
-    result[:, 1] = camera.fy * local[:, 1] / z + camera.cy - seen.pixels[:, 1]
-    disparity = reprojection.bf / z - reprojection.bf / seen.depths
+    result = np.empty((3, len(local))).T  # contiguous per residual
+    result[:, 0] = camera.fx * local[:, 0] / z + camera.cx - observations.pixels[:, 0]
+    result[:, 1] = camera.fy * local[:, 1] / z + camera.cy - observations.pixels[:, 1]
+    disparity = reprojection.bf / z - reprojection.bf / observations.depths
     result[:, 2] = np.where(np.isnan(disparity), 0.0, disparity)
-    result[:, :2] /= seen.sigmas[:, None]
-    result[:, 2] /= seen.depth_sigmas
+    result[:, :2] /= observations.sigmas[:, None]
+    result[:, 2] /= observations.depth_sigmas
     return result
 
 
-def residual_jacobian(local: Array, seen: Observations, reprojection: ReprojectionModel) -> Array:
-    """d residuals / d local: [m, 3, 3], sigmas per m."""
+def residual_jacobian(
+    local: Array, observations: Observations, reprojection: ReprojectionModel
+) -> Array:
+    """Return the Jacobian [m, 3, 3] of the residuals by the local points [m, 3], sigmas per m."""
     camera = reprojection.camera
     reciprocal = 1.0 / np.maximum(local[:, 2], MIN_DEPTH_M)
     result = np.zeros((len(local), 3, 3))
@@ -120,57 +134,62 @@ def residual_jacobian(local: Array, seen: Observations, reprojection: Reprojecti
     result[:, 0, 2] = -camera.fx * local[:, 0] * reciprocal**2
     result[:, 1, 1] = camera.fy * reciprocal
     result[:, 1, 2] = -camera.fy * local[:, 1] * reciprocal**2
-    result[:, 2, 2] = np.where(np.isnan(seen.depths), 0.0, -reprojection.bf * reciprocal**2)
-    result[:, :2] /= seen.sigmas[:, None, None]
-    result[:, 2] /= seen.depth_sigmas[:, None]
+    result[:, 2, 2] = np.where(np.isnan(observations.depths), 0.0, -reprojection.bf * reciprocal**2)
+    result[:, :2] /= observations.sigmas[:, None, None]
+    result[:, 2] /= observations.depth_sigmas[:, None]
     return result
 
 
 def pose_jacobian(local: Array, derivative: Array) -> Array:
-    """local: [m, 3]; derivative: [m, 3, 3] d residual / d local. Returns [m, 3, 6], d residual / d
-    xi.
+    """Return the Jacobian [m, 3, 6] of the residuals by xi of the pose.
+
+    local: [m, 3] points in the camera frame, m; derivative: [m, 3, 3] d residual / d local.
     """
     x, y, z = (local[:, axis, None] for axis in range(3))
     dx, dy, dz = (derivative[:, :, axis] for axis in range(3))
     result = np.empty((len(local), 3, 6))
     result[:, :, :3] = derivative
-    result[:, :, 3] = y * dz - z * dy  # a turn moves the point by phi x local
+    result[:, :, 3] = y * dz - z * dy  # a rotation moves the point by phi x local
     result[:, :, 4] = z * dx - x * dz
     result[:, :, 5] = x * dy - y * dx
     return result
 
 
 def chi_square(
-    T_cw: Array, points: Array, seen: Observations, reprojection: ReprojectionModel
+    T_cw: Array, points: Array, observations: Observations, reprojection: ReprojectionModel
 ) -> Array:
-    """[m] squared residual in sigmas; infinite for points that lie behind the camera."""
+    """Return the chi-square [m] of each measurement, infinite for points behind the camera."""
     local = to_local(T_cw, points)
-    chi2 = np.einsum("ij,ij->i", *(2 * (residuals(local, seen, reprojection),)))
+    chi2 = np.einsum("ij,ij->i", *(2 * (residuals(local, observations, reprojection),)))
     return np.where(local[:, 2] > MIN_DEPTH_M, chi2, np.inf)
 
 
 def huber_weights(chi2: Array, limits: Array) -> Array:
-    """[m] weight of each measurement in iteratively reweighted least squares: 1 inside the limit,
-    falling outside.
+    """Return the Huber weight [m] of each measurement in iteratively reweighted least squares.
+
+    It is 1 up to the limit on chi2, and falls beyond.
     """
     return np.sqrt(np.minimum(1.0, limits / np.maximum(chi2, 1e-12)))
 
 
 def fill_pose_jacobian(
-    J: Array, local: Array, seen: Observations, reprojection: ReprojectionModel
+    J: Array, local: Array, observations: Observations, reprojection: ReprojectionModel
 ) -> None:
-    """J: [6, 3, m], zero at first: pose_jacobian of residual_jacobian, laid out for speed with its
-    zeros left out.
+    """Write `pose_jacobian` of `residual_jacobian` into J: [6, 3, m], which must be zero at first.
+
+    The layout is chosen for speed, and entries that are always zero are skipped.
     """
     camera = reprojection.camera
     x, y = np.ascontiguousarray(local[:, :2].T)
     z = np.maximum(local[:, 2], MIN_DEPTH_M)
     u, v = J[:, 0], J[:, 1]
-    J[0, 0] = camera.fx / (z * seen.sigmas)
-    J[1, 1] = camera.fy / (z * seen.sigmas)
+    J[0, 0] = camera.fx / (z * observations.sigmas)
+    J[1, 1] = camera.fy / (z * observations.sigmas)
     J[2, 0], J[2, 1] = -u[0] * x / z, -v[1] * y / z
-    J[2, 2] = np.where(np.isnan(seen.depths), 0.0, -reprojection.bf / (z * z * seen.depth_sigmas))
-    J[3] = y * J[2]  # a turn moves the point by phi x local
+    J[2, 2] = np.where(
+        np.isnan(observations.depths), 0.0, -reprojection.bf / (z * z * observations.depth_sigmas)
+    )
+    J[3] = y * J[2]  # a rotation moves the point by phi x local
     J[3, 1] -= z * v[1]
     J[4] = -x * J[2]
     J[4, 0] += z * u[0]

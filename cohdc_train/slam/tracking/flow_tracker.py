@@ -1,9 +1,9 @@
 """Optical-flow tracking of the frames between two that are matched with the map.
 
-Keypoints, descriptors, and the search for both take most of a frame's time. A thirtieth of a second
-later the same points are a few pixels away, and the patch around each says where. Flow starts from
-the matched frame every time, never from a frame that flow tracked itself, so that errors do not add
-up.
+Keypoint detection, description, and matching take most of a frame's time. In the next frame the
+same points have moved by a few pixels, and optical flow of the patches around them measures by how
+much. Flow always starts from the matched frame, never from a frame that flow tracked itself, so
+that errors do not accumulate.
 """
 
 from dataclasses import dataclass, replace
@@ -30,12 +30,13 @@ from cohdc_train.slam.tracking.pose_estimate import FrameFeatures, PoseEstimate
 
 @dataclass(frozen=True)
 class FlowState:
-    """A matched frame that flow starts from, and the latest frame tracked from it.
+    """Matched frame that optical flow starts from, and statistics of the latest tracked frame.
 
     gray: [H, W] uint8; point_ids: [m] int64 matched map points; keypoints: m of them; offsets: [m,
     2] px from a point's projection to its keypoint; under_mask: [m] bool, matched although masked;
-    reference: the keyframe that observes most of the points; num_frames: tracked from here;
-    num_started: points tracked in the latest frame; num_agreeing: those that agreed on its pose.
+    reference: the keyframe that observes most of the points; num_frames: frames tracked from here;
+    num_started: points that flow started from in the latest frame; num_agreeing: inliers of its
+    pose.
     """
 
     gray: NDArray[np.uint8]
@@ -50,7 +51,7 @@ class FlowState:
 
     @property
     def tracked_ratio(self) -> float:
-        """Share of the points on which the latest pose rests: a view that changes loses them."""
+        """Return the share of the points that are inliers of the latest pose."""
         return self.num_agreeing / self.num_started
 
     def take(self, rows: NDArray[np.int64]) -> "FlowState":
@@ -66,14 +67,17 @@ class FlowState:
 
 @dataclass(frozen=True)
 class FlowTracks:
-    """Points that flow tracked into a frame. point_ids: [m] int64; keypoints: where, m of them."""
+    """Points that flow tracked into a frame.
+
+    point_ids: [m] int64 map points; keypoints: m of them, at the tracked positions.
+    """
 
     point_ids: NDArray[np.int64]
     keypoints: Keypoints
 
 
 class FlowTracker:
-    """Poses of the frames after a matched one, without keypoints of their own."""
+    """Optical-flow tracker that estimates poses without detecting keypoints."""
 
     def __init__(
         self,
@@ -92,8 +96,8 @@ class FlowTracker:
     ) -> FlowState | None:
         """Return the state of a matched frame, None where it has too few matches.
 
-        mask: [H, W] bool, as given. What was matched under it, because it is static, may be tracked
-        there.
+        mask: [H, W] bool, as given. Points that were matched under it, because they are static, are
+        tracked there as well.
         """
         if len(estimate.matches) < self._config.min_inliers:
             return None
@@ -111,9 +115,16 @@ class FlowTracker:
         state: FlowState,
         prediction: Prediction,
     ) -> tuple[PoseEstimate | None, FlowState]:
-        """Return the frame's pose, None where too few points agree, and the state after it.
+        """Track the points into a frame, and estimate its pose.
 
-        mask: [H, W] bool, True = dynamic: no point is tracked there.
+        Args:
+            frame: the next frame.
+            mask: [H, W] bool, True = dynamic; no point is tracked there.
+            state: the matched frame.
+            prediction: predicted pose of the frame.
+
+        Returns:
+            The pose, None where too few points agree, and the new state.
         """
         tracks, state = self.track_points(frame.rgb, mask, state, prediction.prior.T_cw)
         features = self._measurer.measure(tracks.keypoints, frame, mask)
@@ -126,11 +137,12 @@ class FlowTracker:
         state: FlowState,
         T_cw: Array,
     ) -> tuple[FlowTracks, FlowState]:
-        """Track the points into the next frame. T_cw: [4, 4] predicted pose."""
+        """Track the points into the next frame, whose predicted pose is T_cw [4, 4]."""
         config = self._config
         num_frames = state.num_frames + 1
         start = state
-        if len(state.point_ids) >= config.subsample_above:  # in turns: a pose needs no more
+        if len(state.point_ids) >= config.subsample_above:
+            # Frames track different subsets in turn, since a pose needs no more points.
             turn = num_frames % config.subsample
             start = state.take(np.flatnonzero(state.point_ids % config.subsample == turn))
         num_started = len(start.point_ids)
@@ -139,7 +151,7 @@ class FlowTracker:
         rows = np.flatnonzero(is_found & _is_inside(pixels, self.map.camera))
         rows = rows[start.under_mask[rows] | ~_is_covered(pixels[rows], mask)]
 
-        # Points may have been merged since: each is tracked once, and a merged one is not refined.
+        # Points may have been merged: each is tracked once, and a merged one does not stay refined.
         known = start.point_ids[rows]
         ids, first = np.unique(self.map.resolve_merged(known), return_index=True)
         rows, is_same = rows[first], ids == known[first]
@@ -155,21 +167,26 @@ class FlowTracker:
         state: FlowState,
         prediction: Prediction,
     ) -> tuple[PoseEstimate | None, FlowState]:
-        """Return the pose on which enough tracked points agree. frame_features: of the tracks."""
+        """Estimate the pose from tracked points, None where too few agree, and the new state.
+
+        frame_features: keypoints of the tracks.
+        """
         features = frame_features.features
         needed = max(self._config.min_inliers, self._config.min_inlier_ratio * state.num_started)
         if len(features) < needed:
             return None, state
         matches = Matches(tracks.point_ids, np.arange(len(features)))
-        points, seen = self.map.measured(matches, features)
+        points, observations = self.map.measured(matches, features)
         prior = prediction.prior_for(len(features))
         start = prediction.prior.T_cw
-        T_cw, inlier = optimize_pose(start, points, seen, self._reprojection, prior=prior)
+        T_cw, inlier = optimize_pose(start, points, observations, self._reprojection, prior=prior)
         num_inliers = int(inlier.sum())
         state = replace(state, num_agreeing=num_inliers)
         if num_inliers < needed:
             return None, state
-        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._reprojection)
+        information = pose_information(
+            T_cw, points[inlier], observations.take(inlier), self._reprojection
+        )
         estimate = PoseEstimate(
             T_cw,
             matches.take(inlier),
@@ -186,8 +203,8 @@ class FlowTracker:
     def needs_match(self, state: FlowState, in_hurry: bool, mapper_is_busy: bool) -> bool:
         """Decide whether the frame that flow tracked is matched with the map as well.
 
-        in_hurry: there is no time for it; mapper_is_busy: the frame would not become a keyframe, so
-        that matching may wait unless much has changed.
+        in_hurry: there is no time for matching; mapper_is_busy: the frame would not become a
+        keyframe, so that matching may wait unless the view has changed much.
         """
         config = self._config
         if in_hurry:
@@ -200,7 +217,7 @@ class FlowTracker:
     def _flow(
         self, start: FlowState, gray: NDArray[np.uint8], T_cw: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return where Lucas-Kanade finds the points, [m, 2] px, and [m] bool whether it does."""
+        """Run Lucas-Kanade optical flow; returns positions [m, 2] px and [m] bool, True = found."""
         if len(start.point_ids) == 0:
             return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
         config = self._config
@@ -229,13 +246,13 @@ class FlowTracker:
 
 
 def _is_inside(pixels: Array, camera: Camera) -> NDArray[np.bool_]:
-    """Return [m] bool, whether pixels [m, 2] lie in the image."""
+    """Return [m] bool, True = the pixel lies in the image."""
     x, y = np.rint(pixels).T
     return np.asarray((x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
 
 
 def _is_covered(pixels: Array, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Return [m] bool, whether pixels [m, 2] in the image lie under the mask."""
+    """Return [m] bool, True = the pixel lies under the mask."""
     if mask is None:
         return np.zeros(len(pixels), dtype=np.bool_)
     x, y = np.rint(pixels).astype(np.int64).T

@@ -1,4 +1,4 @@
-"""Matching of a frame with the map: its keypoints, and its pose by them."""
+"""Matching of a frame with the map: extraction of its keypoints, and its pose."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ _FIRST_INFORMATION = 1e9  # of the first pose, which is the origin of the world
 
 
 class FrameMatcher:
-    """Extraction of a frame's keypoints, and the pose by matching them with the map."""
+    """Matcher that extracts a frame's keypoints and estimates its pose against the map."""
 
     def __init__(self, parts: TrackerParts, config: TrackingConfig) -> None:
         self._parts = parts
@@ -33,10 +33,17 @@ class FrameMatcher:
         prediction: Prediction | None,
         flow_estimate: PoseEstimate | None = None,
     ) -> tuple[PoseEstimate | None, FrameFeatures]:
-        """Return the pose by the map, else that by flow, else None; and the frame's keypoints.
+        """Estimate the pose of a frame against the map; the flow estimate is the fallback.
 
-        mask: [H, W] bool, as given; last: estimate of the frame before, None unless tracking;
-        prediction: of this frame.
+        Args:
+            frame: the frame.
+            mask: [H, W] bool, as given.
+            last: estimate of the frame before, None unless tracking.
+            prediction: predicted pose of this frame.
+            flow_estimate: pose by optical flow.
+
+        Returns:
+            The pose, None where both fail, and the frame's keypoints.
         """
         dynamic_mask = self._estimate_dynamic_mask(frame, mask, last, prediction)
         refiner = self._parts.refiner
@@ -45,7 +52,7 @@ class FrameMatcher:
         extracted = FrameFeatures(self._extract(frame, dynamic_mask), dynamic_mask, pyramid)
         estimate = self._localize(frame, extracted, last, prediction, flow_estimate)
 
-        # The mask may cover all that the map knows: its points are static, so match them all.
+        # The mask may cover all mapped points. They are static: match the whole image.
         if estimate is None and dynamic_mask is not None and self._map.keyframes:
             extracted = replace(extracted, features=self._extract(frame, None))
             estimate = self._localize(frame, extracted, last, prediction, flow_estimate)
@@ -63,15 +70,17 @@ class FrameMatcher:
         last: PoseEstimate | None,
         prediction: Prediction | None,
     ) -> Mask | None:
-        """Return the mask without static objects, and with what depth shows to move."""
+        """Return the mask without static objects, and with the moving objects that depth shows."""
         if self._parts.dynamic_mask is None or last is None or prediction is None:
             return mask
-        around = self._map.covisible(last.matches.point_ids, self._config.local_keyframes)
+        neighbors = self._map.covisible(last.matches.point_ids, self._config.local_keyframes)
         T_cw = prediction.prior.T_cw
-        return self._parts.dynamic_mask.estimate(mask, frame.depth, T_cw, around, frame.timestamp)
+        return self._parts.dynamic_mask.estimate(
+            mask, frame.depth, T_cw, neighbors, frame.timestamp
+        )
 
     def _extract(self, frame: RGBDFrame, mask: Mask | None) -> Features:
-        """Return the keypoints of a frame outside a mask, with depth."""
+        """Extract the keypoints of a frame outside a mask, with depth."""
         keypoints = self._parts.extractor.find(frame.rgb, mask)
         return self._parts.measurer.measure(keypoints, frame, mask)
 
@@ -83,7 +92,7 @@ class FrameMatcher:
         prediction: Prediction | None,
         flow_estimate: PoseEstimate | None,
     ) -> PoseEstimate | None:
-        """Return the pose by the map, by refined keypoints or else by those extracted."""
+        """Estimate the pose against the map, by refined keypoints if possible."""
         if not self._map.keyframes:
             return self._initialize(extracted)
         localizer = self._parts.localizer
@@ -105,7 +114,7 @@ class FrameMatcher:
         return localizer.refine_pose(extracted, estimate)
 
     def _initialize(self, extracted: FrameFeatures) -> PoseEstimate | None:
-        """Return the pose of a map's first frame, None where it has too few points."""
+        """Return the first pose of a map, None where the frame has too few points with depth."""
         num_points = np.count_nonzero(~np.isnan(extracted.features.depths))
         if num_points < self._config.min_points_to_initialize:
             return None

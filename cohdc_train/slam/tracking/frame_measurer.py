@@ -1,4 +1,4 @@
-"""Measurement of keypoints at the one time of their frame."""
+"""Measurement of keypoints, corrected to the timestamp of their frame."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,10 @@ from cohdc_train.slam.tracking.motion_model import MotionModel
 
 
 class FrameMeasurer:
-    """Undistorted positions and depths of keypoints, corrected for the camera's motion.
+    """Undistorted positions and depths of keypoints, corrected for the camera motion.
 
-    Depth may be taken later than color, and a rolling shutter reads one row after the other.
+    The depth image may be taken later than the color image, and a rolling shutter reads the rows
+    one after the other.
     """
 
     def __init__(self, extractor: OrbExtractor, motion: MotionModel) -> None:
@@ -24,7 +25,7 @@ class FrameMeasurer:
     def measure(
         self, keypoints: Keypoints, frame: RGBDFrame, mask: NDArray[np.bool_] | None
     ) -> Features:
-        """Measure the keypoints of a frame; mask: [H, W] bool, near which depth is refused."""
+        """Measure the keypoints of a frame; depth is refused near the mask [H, W] bool."""
         twist = self._motion.twist
         T_depth_color = None
         if twist is not None and frame.depth_timestamp is not None:

@@ -1,4 +1,4 @@
-"""Pose of one frame against the map: from the last pose, or from nothing after a loss."""
+"""Localization of one frame in the map, by its predicted pose or by relocalization."""
 
 from dataclasses import dataclass
 
@@ -16,6 +16,7 @@ from cohdc_train.slam.features.descriptors import thumbnail
 from cohdc_train.slam.features.matching import Matches, match_descriptors, match_projected
 from cohdc_train.slam.geometry.se3 import Array
 from cohdc_train.slam.mapping.map import Map
+from cohdc_train.slam.mapping.projection import project_points
 from cohdc_train.slam.optimization.pose import optimize_pose, pose_information
 from cohdc_train.slam.optimization.ransac import ransac_pose
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel
@@ -34,10 +35,10 @@ class LocalizerConfig:
 
 
 class Localizer:
-    """Localization of frames in a map.
+    """Localizer of frames in a map.
 
-    First the points that a frame observes (`track_local_map`, `relocalize`), then its final pose
-    (`refine_pose`).
+    `track_local_map` and `relocalize` match a frame with the map; `refine_pose` estimates its final
+    pose.
     """
 
     def __init__(
@@ -56,13 +57,21 @@ class Localizer:
         prediction: Prediction,
         flow_estimate: PoseEstimate | None = None,
     ) -> PoseEstimate | None:
-        """Return the pose of the frame after `last`, None where tracking fails.
+        """Match the frame after `last` with the local map, and estimate its pose.
 
-        Relocalizes where not even the points of the last frame are found.
+        A flow estimate or a consistent prediction is exact to a few px, so that the local map is
+        searched directly. Otherwise, and where that fails, a rough pose is estimated first from the
+        points of the last frame. The frame is relocalized where that fails, too.
 
-        flow_estimate: pose by optical flow. It and a consistent prediction are exact to a few px:
-        the local map is searched at once. Otherwise, and where that fails, a rough pose comes
-        first. Where a frame sees little, the prediction counts as a prior.
+        Args:
+            frame: its keypoints.
+            rgb: [H, W, 3] its image.
+            last: estimate of the frame before.
+            prediction: predicted pose; it counts as a prior where the frame has few matches.
+            flow_estimate: pose by optical flow.
+
+        Returns:
+            The pose, None where tracking and relocalization fail.
         """
         config = self._config.tracking
         if prediction.is_consistent or flow_estimate is not None:
@@ -77,9 +86,9 @@ class Localizer:
         return self._search_local_map(frame, rough, config.min_inliers, prediction)
 
     def relocalize(self, frame: FrameFeatures, rgb: NDArray[np.uint8]) -> PoseEstimate | None:
-        """Return the pose of a frame without a prediction, None where no keyframe fits.
+        """Estimate the pose of a frame without a prediction, None where no keyframe matches.
 
-        Tries the keyframes that look most like the frame, and the newest.
+        The keyframes with the most similar thumbnails are tried, and the newest one.
         """
         config = self._config.tracking
         image = thumbnail(rgb)
@@ -100,20 +109,20 @@ class Localizer:
         return None
 
     def refine_pose(self, frame: FrameFeatures, estimate: PoseEstimate) -> PoseEstimate | None:
-        """Return the final pose, by keypoints that may have been refined; None where few agree.
+        """Estimate the final pose by keypoints that may be refined, None with too few inliers.
 
-        Outliers stay matched, unless they belong to a moving cluster. The prior counts if it did
-        in the estimate: a relocalized pose speaks against it.
+        Outliers stay matched, unless they belong to a moving cluster. The prior counts if it did in
+        the estimate; it does not after relocalization.
         """
         ids = estimate.matches.point_ids
-        points, seen = self.map.measured(estimate.matches, frame.features)
+        points, observations = self.map.measured(estimate.matches, frame.features)
         segments_motion = self._config.motion_segmentation.enabled
         if segments_motion:
             num_found = self.map.found[ids]
             T_cw, inlier, moving = estimate_static_pose(
                 estimate.T_cw,
                 points,
-                seen,
+                observations,
                 self._reprojection,
                 num_found,
                 estimate.prior,
@@ -121,15 +130,17 @@ class Localizer:
             )
         else:
             T_cw, inlier = optimize_pose(
-                estimate.T_cw, points, seen, self._reprojection, prior=estimate.prior
+                estimate.T_cw, points, observations, self._reprojection, prior=estimate.prior
             )
             moving = np.zeros(len(ids), dtype=np.bool_)
         num_inliers = int(inlier.sum())
         if num_inliers < self._config.tracking.min_inliers:
             return None
         if segments_motion:
-            self.map.update_static_odds(ids[inlier], ids[moving])
-        information = pose_information(T_cw, points[inlier], seen.take(inlier), self._reprojection)
+            self.map.static_odds.update(ids[inlier], ids[moving])
+        information = pose_information(
+            T_cw, points[inlier], observations.take(inlier), self._reprojection
+        )
         return PoseEstimate(
             T_cw,
             estimate.matches.take(~moving),
@@ -143,9 +154,10 @@ class Localizer:
     def _track_last_points(
         self, frame: FrameFeatures, last: PoseEstimate, prediction: Prediction
     ) -> PoseEstimate | None:
-        """Return a rough pose from the points of the last frame.
+        """Estimate a rough pose from the points of the last frame.
 
-        They are searched near the predicted projections, then further around the last ones.
+        They are searched near the projections by the predicted pose, then in a larger radius around
+        those by the last pose.
         """
         config = self._config.tracking
         attempts = (
@@ -153,7 +165,7 @@ class Localizer:
             (last.T_cw, config.radius_last_pose_px),
         )
         for guess, radius in attempts:
-            projected = self.map.project(last.matches.point_ids, guess)
+            projected = project_points(self.map, last.matches.point_ids, guess)
             matches = match_projected(projected, frame.features, radius, self._config.matching)
             rough = self._solve(frame, matches, guess, self._config.ransac.hypotheses)
             if rough is not None:
@@ -163,20 +175,20 @@ class Localizer:
     def _solve(
         self, frame: FrameFeatures, matches: Matches, guess: Array | None, hypotheses: int
     ) -> PoseEstimate | None:
-        """Return a rough pose by RANSAC, None where few matches agree."""
+        """Estimate a rough pose by RANSAC, None with too few inliers."""
         needed = self._config.tracking.min_inliers_rough
         if len(matches) < needed:
             return None
-        points, seen = self.map.measured(matches, frame.features)
+        points, observations = self.map.measured(matches, frame.features)
         found = ransac_pose(
-            points, seen, self.map.camera, self._rng, self._config.ransac, hypotheses, guess
+            points, observations, self.map.camera, self._rng, self._config.ransac, hypotheses, guess
         )
         if found is None or found[1].sum() < needed:
             return None
-        T_cw, agree = found
-        matches = matches.take(agree)
+        T_cw, is_inlier = found
+        matches = matches.take(is_inlier)
         T_cw, inlier = optimize_pose(
-            T_cw, points[agree], seen.take(agree), self._reprojection, rounds=1
+            T_cw, points[is_inlier], observations.take(is_inlier), self._reprojection, rounds=1
         )
         num_inliers = int(inlier.sum())
         if num_inliers < needed:
@@ -190,21 +202,23 @@ class Localizer:
         min_inliers: int,
         prediction: Prediction | None = None,
     ) -> PoseEstimate | None:
-        """Return the pose by all points of the keyframes around, None where few agree."""
+        """Estimate the pose by all points of the covisible keyframes, None with too few inliers."""
         config = self._config.tracking
         keyframes = self.map.covisible(rough.matches.point_ids, config.local_keyframes)
-        projected = self.map.project(self.map.points_of(keyframes), rough.T_cw)
+        projected = project_points(self.map, self.map.points_of(keyframes), rough.T_cw)
         radius = config.radius_local_map_px
         matches = match_projected(projected, frame.features, radius, self._config.matching)
-        points, seen = self.map.measured(matches, frame.features)
+        points, observations = self.map.measured(matches, frame.features)
         prior = None if prediction is None else prediction.prior_for(len(matches))
-        T_cw, inlier = optimize_pose(rough.T_cw, points, seen, self._reprojection, prior=prior)
+        T_cw, inlier = optimize_pose(
+            rough.T_cw, points, observations, self._reprojection, prior=prior
+        )
         num_inliers = int(inlier.sum())
         if num_inliers < min_inliers:
             return None
         matches = matches.take(inlier)
         reference = self.map.covisible(matches.point_ids, 1)
-        if not reference:  # no keyframe is remembered that observes one of them
+        if not reference:  # no stored observer of these points is left in the map
             return None
         self.map.visible[projected.ids] += 1
         self.map.found[matches.point_ids] += 1

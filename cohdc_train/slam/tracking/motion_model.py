@@ -1,6 +1,7 @@
-"""Constant-velocity Kalman filter that predicts the next frame's pose and how certain it is.
+"""Constant-velocity Kalman filter that predicts a frame's pose and its uncertainty.
 
-What a frame measures decides its pose, but a frame that sees only a part of the room cannot jump.
+The measurements of a frame determine its pose; the prediction limits jumps of frames with few
+measurements.
 """
 
 from dataclasses import dataclass, replace
@@ -11,14 +12,15 @@ from cohdc_train.slam.config import MotionModelConfig
 from cohdc_train.slam.geometry.se3 import Array, exp_se3, inverse, log_se3
 from cohdc_train.slam.optimization.reprojection import Prior
 
-_MAX_VELOCITY_SIGMAS = 3  # of the initial velocity, above which a jump says nothing about velocity
+_MAX_VELOCITY_SIGMAS = 3  # of the initial velocity; above, the velocity after a jump is unknown
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted pose of a frame. is_consistent: the latest frames were where they were predicted.
+    """Predicted pose of a frame.
 
-    prior_below_points: points of a frame, below which the prior counts.
+    is_consistent: the latest frames agreed with their predictions; prior_below_points: number of
+    points of a frame, below which the prior counts.
     """
 
     prior: Prior
@@ -26,7 +28,7 @@ class Prediction:
     prior_below_points: int
 
     def prior_for(self, num_points: int) -> Prior | None:
-        """Return the prior for a frame that sees so many points.
+        """Return the prior for a frame that observes a number of points.
 
         None where these suffice, or where the camera does not move as predicted.
         """
@@ -53,7 +55,7 @@ class _State:
 
 
 class MotionModel:
-    """Constant-velocity motion of the camera."""
+    """Constant-velocity model of the camera motion."""
 
     def __init__(self, config: MotionModelConfig = MotionModelConfig()) -> None:
         self._config = config
@@ -62,7 +64,7 @@ class MotionModel:
         self._state: _State | None = None
 
     def reset(self) -> None:
-        """Forget the motion: the track is lost."""
+        """Forget the motion after the track is lost."""
         self._state = None
 
     def correct(self, motion: Array) -> None:
@@ -72,7 +74,10 @@ class MotionModel:
 
     @property
     def twist(self) -> Array | None:
-        """Velocity [6], (m/s, rad/s), None while unknown: T_cw(t + dt) = exp(twist dt) T_cw(t)."""
+        """Return the velocity [6], (m/s, rad/s), None while unknown.
+
+        T_cw(t + dt) = exp(twist dt) T_cw(t).
+        """
         state = self._state
         if state is None or not 0 < state.interval_s <= self._config.max_gap_s:
             return None
@@ -81,7 +86,7 @@ class MotionModel:
     def predict(self, timestamp: float) -> Prediction | None:
         """Predict the pose at a timestamp, s; None before the first frame and after a reset.
 
-        After a pause the camera is assumed to have moved on for max_gap_s only.
+        After a long gap the camera is assumed to have moved for max_gap_s only.
         """
         state = self._state
         if state is None:
@@ -96,10 +101,13 @@ class MotionModel:
         information: Array,
         prior_gradient: Array | None = None,
     ) -> None:
-        """Update the motion with the pose of a frame.
+        """Update the filter with the pose of a frame.
 
-        T_cw: [4, 4] m; information: [6, 6] of the frame's measurements; prior_gradient: [6]
-        `Prior.gradient` of the prediction where the pose is a compromise with it.
+        Args:
+            timestamp: s.
+            T_cw: [4, 4] world to camera, m.
+            information: [6, 6] of the frame's measurements.
+            prior_gradient: [6] `Prior.gradient` at the pose, where the prediction counted.
         """
         floor = np.full(6, self._config.pose_noise_floor)
         covariance = np.asarray(
@@ -129,16 +137,13 @@ class MotionModel:
     def _updated(
         self, state: _State, timestamp: float, T_cw: Array, measured: Array, gradient: Array
     ) -> _State:
-        """Return the state after a measured pose: the step of the Kalman filter.
-
-        measured: [6, 6] covariance of the pose.
-        """
+        """Return the state updated by a measured pose with covariance [6, 6]."""
         config = self._config
         covariance = self._predict_covariance(state, timestamp)
         prior = self._prior(state, timestamp, covariance)
         interval_s = timestamp - state.timestamp
 
-        # The innovation, by how much it was before the compromise with the prior.
+        # The innovation of the measurement alone, before its fusion with the prior.
         innovation = log_se3(T_cw @ inverse(prior.T_cw)) + measured @ gradient
         innovation_covariance = covariance[:6, :6] + measured
         inverted = np.linalg.inv(innovation_covariance)
@@ -146,7 +151,7 @@ class MotionModel:
         change = min(nis, config.max_nis) / 6 - state.mean_nis
         mean_nis = state.mean_nis + config.nis_smoothing * change
 
-        if nis > config.max_nis:  # a jump: the pose is believed, the motion starts again
+        if nis > config.max_nis:  # a jump: accept the pose, and restart the filter
             velocity = log_se3(T_cw @ inverse(state.T_cw)) / max(interval_s, config.min_gap_s)
             limit = _MAX_VELOCITY_SIGMAS * self._unknown_velocity
             if not np.all(np.abs(velocity) < limit):
@@ -165,14 +170,14 @@ class MotionModel:
         )
 
     def _prior(self, state: _State, timestamp: float, covariance: Array) -> Prior:
-        """Return the pose predicted for a timestamp, and its information by covariance [12, 12]."""
+        """Return the predicted pose with its information; covariance: [12, 12] predicted."""
         information = np.asarray(np.linalg.inv(covariance[:6, :6]), dtype=np.float64)
         longest = max(state.interval_s, self._config.max_gap_s)
         ahead_s = min(max(timestamp - state.timestamp, 0.0), longest)
         return Prior(exp_se3(ahead_s * state.velocity) @ state.T_cw, information)
 
     def _predict_covariance(self, state: _State, timestamp: float) -> Array:
-        """Return the covariance [12, 12] at a timestamp, before anything is measured."""
+        """Return the predicted covariance [12, 12] at a timestamp, before the update."""
         dt = min(max(timestamp - state.timestamp, 0.0), self._config.max_prediction_s)
         identity = np.eye(6)
         step = np.block([[identity, dt * identity], [np.zeros((6, 6)), identity]])

@@ -1,4 +1,4 @@
-"""Pose of a frame against the map, and the state of a tracker."""
+"""Estimated pose of a frame, and the keypoints that it is based on."""
 
 from dataclasses import dataclass, field
 
@@ -16,7 +16,7 @@ from cohdc_train.slam.optimization.reprojection import Prior
 
 @dataclass(frozen=True)
 class FrameFeatures:
-    """Keypoints of a frame.
+    """Keypoints of a frame, and the mask they were extracted with.
 
     dynamic_mask: [H, W] bool, where no keypoint was used, None where nothing is dynamic; pyramid:
     of the frame's image, None where the keypoints come from optical flow or are not refined.
@@ -29,13 +29,14 @@ class FrameFeatures:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Pose of a frame, and what it rests on.
+    """Pose of a frame, with the matches and the prior that it is based on.
 
-    T_cw: [4, 4] world to camera, m; matches: map points that the frame observes; num_inliers: those
-    that agree with the pose; reference: the keyframe that observes most of them, None while the
-    pose is a rough one; prior: the prediction, where it counted as well; information: [6, 6]
-    inverse covariance of the pose by the measurements alone, in the camera's frame, 0 until the
-    pose is final; allows_keyframe: whether the frame may become a keyframe.
+    T_cw: [4, 4] world to camera, m; matches: map points that the frame observes; num_inliers:
+    matches that agree with the pose; reference: the keyframe that observes most of them, None for a
+    rough pose; prior: the prediction, where it counted as well; information: [6, 6] inverse
+    covariance of the pose by the measurements alone, in the camera frame, 0 until the pose is
+    final; source: the map or optical flow; allows_keyframe: whether the frame may become a
+    keyframe.
     """
 
     T_cw: Array
@@ -50,10 +51,10 @@ class PoseEstimate:
 
     @property
     def features(self) -> Features:
-        """Keypoints of the frame."""
+        """Return the keypoints of the frame."""
         return self.frame_features.features
 
     @property
     def prior_gradient(self) -> Array:
-        """Gradient [6] of the prior at the pose, 0 where it did not count."""
+        """Return the gradient [6] of the prior at the pose, 0 where it did not count."""
         return np.zeros(6) if self.prior is None else self.prior.gradient(self.T_cw)

@@ -11,7 +11,7 @@ from cohdc_train.slam.tracking.pose_estimate import FrameFeatures, PoseEstimate
 
 
 class PoseReporter:
-    """Results of one frame, and the time until its pose was known."""
+    """Result of one frame, and the time until its pose was known."""
 
     def __init__(
         self,
@@ -20,7 +20,10 @@ class PoseReporter:
         is_initialized: bool,
         on_pose: PoseCallback | None,
     ) -> None:
-        """Start the clock. is_initialized: there is a map; on_pose: called with the first pose."""
+        """Start the clock of a frame.
+
+        is_initialized: there is a map; on_pose: called with the first result.
+        """
         self._start_s = time.perf_counter()
         self._frame = frame
         self._mask = mask
@@ -29,7 +32,7 @@ class PoseReporter:
         self._known_s: float | None = None
 
     def publish(self, result: PoseEstimate | FrameFeatures) -> None:
-        """Publish the frame's pose, or that it has none; only the first call counts."""
+        """Publish the frame's pose, or that it has none; only the first call has an effect."""
         if self._known_s is not None:
             return
         self._known_s = time.perf_counter()
@@ -39,7 +42,7 @@ class PoseReporter:
     def result(
         self, result: PoseEstimate | FrameFeatures, is_keyframe: bool = False
     ) -> FrameResult:
-        """Return the result so far. result: keypoints alone where the frame has no pose."""
+        """Return the result so far; `result` is the keypoints alone where the frame has no pose."""
         now = time.perf_counter()
         known_s = now if self._known_s is None else self._known_s
         tracking_ms, mapping_ms = 1e3 * (known_s - self._start_s), 1e3 * (now - known_s)

@@ -1,4 +1,4 @@
-"""Tracker: the pose of each frame, and the decision on keyframes."""
+"""Tracker that estimates the pose of each frame and decides on keyframes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,11 +26,11 @@ from cohdc_train.types import Mask
 
 
 class Tracker:
-    """Tracking of frames against the map.
+    """Tracker of frames against the map.
 
     The same frames and seed give the same poses, bit for bit, unless mapping runs in parallel.
-    frame_time_used: returns which share of the time until the next frame has elapsed; what would
-    delay that frame is postponed.
+    frame_time_used: returns which share of the time until the next frame has elapsed; work that
+    would delay that frame is postponed.
     """
 
     def __init__(
@@ -54,15 +54,18 @@ class Tracker:
     ) -> FrameResult:
         """Estimate the camera pose of the next frame, and extend the map where it shows new places.
 
-        mask: [H, W] bool, True = dynamic: nothing there enters the map. Where the rest does not
-        suffice for a pose, the whole image is matched with the map, whose points are static; such a
-        frame is no keyframe. on_pose: called as soon as the pose is known, before the work that the
-        frame makes for later ones; the returned pose may be more exact.
+        Args:
+            frame: the frame.
+            mask: [H, W] bool, True = dynamic; nothing under it is added to the map. Where the
+                rest of the image does not suffice for a pose, the whole image is matched with the
+                map, whose points are static; such a frame does not become a keyframe.
+            on_pose: called as soon as the pose is known, before mapping; the returned pose may be
+                more accurate.
         """
         parts, state = self.parts, self.state
         report = PoseReporter(frame, mask, bool(self.map.keyframes), on_pose)
 
-        # Mapping may have moved keyframes: the last pose moves with its reference keyframe.
+        # Parallel bundle adjustment may move keyframes; the last pose moves with its reference.
         self._apply_map_updates(parts.mapper.apply_finished_adjustment)
 
         # Predict the pose with constant velocity; None before the first frame and while lost.
@@ -78,7 +81,7 @@ class Tracker:
                 self._finish_flow_frame(frame, flow_estimate, time_used)
                 return report.result(flow_estimate)
 
-        # Match the local map, or relocalize in all of it; on failure the flow estimate stands.
+        # Match the local map, or relocalize in the whole map; the flow estimate is the fallback.
         estimate, frame_features = self._matcher.match(
             frame, mask, state.last, prediction, flow_estimate
         )
@@ -88,13 +91,13 @@ class Tracker:
             return report.result(frame_features)
         self._update_motion(frame, estimate)
 
-        # Insert a keyframe, unless mapping still works on the one before.
+        # Insert a keyframe, unless mapping is still busy with the one before.
         needs_keyframe = parts.keyframe_policy.needs_keyframe(estimate, self.map, state)
         is_keyframe = needs_keyframe and parts.mapper.is_idle
         if is_keyframe:
             estimate = self._insert_keyframe(frame, estimate)
 
-        # Remember the frame: flow starts from it, and the history stores its pose.
+        # Store the frame: flow starts from it, and the history has its pose.
         state.update(estimate, is_keyframe)
         self._restart_flow(frame, mask, estimate)
         self._record(frame, estimate)
@@ -105,7 +108,7 @@ class Tracker:
     def _track_by_flow(
         self, frame: RGBDFrame, mask: Mask | None, prediction: Prediction | None
     ) -> PoseEstimate | None:
-        """Return the pose by optical flow, None where there is none to start from or it fails."""
+        """Track by optical flow; None where there is no frame to start from, or where it fails."""
         state = self.state
         state.flow_ratio = 1.0
         if self.parts.flow is None or state.flow is None or prediction is None:
@@ -125,7 +128,7 @@ class Tracker:
     def _finish_flow_frame(
         self, frame: RGBDFrame, estimate: PoseEstimate, time_used: float
     ) -> None:
-        """Remember a frame that only flow tracked, and use the time left for mapping."""
+        """Store a frame that only flow tracked, and use the remaining time for mapping."""
         has_time = time_used <= self._realtime.map_until
         self._update_motion(frame, estimate)
         self.state.update(estimate, is_keyframe=False)
@@ -140,7 +143,7 @@ class Tracker:
         )
 
     def _insert_keyframe(self, frame: RGBDFrame, estimate: PoseEstimate) -> PoseEstimate:
-        """Insert the frame into the map, and return its estimate there."""
+        """Insert the frame into the map, and return its estimate as a keyframe."""
         features, mask = estimate.features, estimate.frame_features.dynamic_mask
         point_ids = np.full(len(features), -1)
         point_ids[estimate.matches.keypoints] = estimate.matches.point_ids
@@ -172,12 +175,12 @@ class Tracker:
         )
 
     def _restart_flow(self, frame: RGBDFrame, mask: Mask | None, estimate: PoseEstimate) -> None:
-        """Let flow start from a matched frame; where flow itself found the pose, it goes on."""
+        """Start optical flow from a matched frame; after a fallback to flow, it continues."""
         if self.parts.flow is not None and estimate.source == "map":
             self.state.flow = self.parts.flow.start(frame.rgb, estimate, mask)
 
     def _record(self, frame: RGBDFrame, estimate: PoseEstimate, refine: bool = True) -> None:
-        """Store the frame for the end of the sequence.
+        """Store the frame for the trajectory and for global bundle adjustment.
 
         refine: refine the keypoints that flow tracked, where they are stored.
         """
@@ -204,14 +207,14 @@ class Tracker:
             )
 
     def _set_lost(self) -> None:
-        """Forget where the camera was."""
+        """Reset the motion model and the dynamic mask after the track is lost."""
         self.state.set_lost(bool(self.map.keyframes))
         self.parts.motion.reset()
         if self.parts.dynamic_mask is not None:
             self.parts.dynamic_mask.reset()
 
     def _apply_map_updates(self, update: Callable[[], None]) -> None:
-        """Let the map change; the last pose moves with its reference keyframe."""
+        """Run an update of the map, and move the last pose with its reference keyframe."""
         last = self.state.last
         if last is None or last.reference is None:
             update()

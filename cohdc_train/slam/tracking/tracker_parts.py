@@ -1,4 +1,4 @@
-"""Parts that a tracker works with."""
+"""Components of a tracker."""
 
 from dataclasses import dataclass
 
@@ -19,9 +19,10 @@ from cohdc_train.slam.tracking.motion_model import MotionModel
 
 @dataclass(frozen=True)
 class TrackerParts:
-    """Parts that a tracker works with; optional ones are None where they are switched off.
+    """Components of a tracker; optional ones are None where they are disabled.
 
-    mapper: inserts keyframes; history, intermediate_frames: what tracked frames leave for the end.
+    mapper: inserts keyframes; history, intermediate_frames: poses and observations of tracked
+    frames for the end of the sequence.
     """
 
     point_map: Map

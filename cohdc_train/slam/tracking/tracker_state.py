@@ -11,10 +11,10 @@ from cohdc_train.slam.tracking.pose_estimate import PoseEstimate
 class TrackerState:
     """State of a tracker between two frames.
 
-    last: estimate of the latest frame, None unless tracking; flow: the matched frame that optical
-    flow starts from; max_tracked: most matches of a frame since the last keyframe;
-    frames_since_keyframe: tracked ones; flow_ratio: share of the points that flow kept in this
-    frame, 1 where it gave no pose.
+    last: estimate of the latest frame, None unless tracking; flow: matched frame that optical flow
+    starts from; max_tracked: most matches of a frame since the last keyframe;
+    frames_since_keyframe: tracked frames; flow_ratio: share of the points that flow kept in this
+    frame, 1 without a flow pose.
     """
 
     status: Status = "initializing"
@@ -25,7 +25,7 @@ class TrackerState:
     flow_ratio: float = 1.0
 
     def update(self, estimate: PoseEstimate, is_keyframe: bool) -> None:
-        """Take the estimate of a tracked frame."""
+        """Store the estimate of a tracked frame."""
         self.status = "tracking"
         self.last = estimate
         self.frames_since_keyframe += 1
@@ -33,12 +33,12 @@ class TrackerState:
             self.frames_since_keyframe = 1
             self.max_tracked = 0.0
         elif estimate.source == "map":
-            # Without what the view has lost since the last matched frame there would be more.
+            # Compensate for the points that have left the view since the last matched frame.
             num_tracked = len(estimate.matches) / self.flow_ratio
             self.max_tracked = max(self.max_tracked, num_tracked)
 
     def set_lost(self, is_initialized: bool) -> None:
-        """Forget where the camera was. is_initialized: there is a map."""
+        """Set the state of a lost frame; is_initialized: there is a map."""
         self.status = "lost" if is_initialized else "initializing"
         self.last = None
         self.flow = None

@@ -176,17 +176,17 @@ def test_distortion_inverts_undistortion(x: float, y: float) -> None:
 
 def test_moving_point_loses_weight_and_regains_it_at_rest() -> None:
     world, ids = Map(CAMERA), np.array([0, 1])
-    np.testing.assert_array_equal(world.static_weight(ids), 1)
+    np.testing.assert_array_equal(world.static_odds.weight(ids), 1)
     weights = []
     for _ in range(5):
-        world.update_static_odds(still=ids[1:], moving=ids[:1])
-        weights.append(world.static_weight(ids)[0])
+        world.static_odds.update(static=ids[1:], moving=ids[:1])
+        weights.append(world.static_odds.weight(ids)[0])
     assert weights == sorted(weights, reverse=True)
     assert weights[-1] < 0.02
-    assert world.static_weight(ids)[1] == 1
+    assert world.static_odds.weight(ids)[1] == 1
     for _ in range(100):
-        world.update_static_odds(still=ids, moving=ids[:0])
-    np.testing.assert_array_equal(world.static_weight(ids), 1)
+        world.static_odds.update(static=ids, moving=ids[:0])
+    np.testing.assert_array_equal(world.static_odds.weight(ids), 1)
 
 
 def test_merged_duplicate_keeps_its_motion_odds() -> None:
@@ -195,11 +195,11 @@ def test_merged_duplicate_keeps_its_motion_odds() -> None:
     track(slam, *render(room(), STILL)[:2], 0.0)
     world = slam.map
     for moving in ([7, 12], [12]):
-        world.update_static_odds(still=np.zeros(0, dtype=np.int64), moving=np.array(moving))
-    caught = world.static_weight(np.array([7, 12]))
+        world.static_odds.update(static=np.zeros(0, dtype=np.int64), moving=np.array(moving))
+    caught = world.static_odds.weight(np.array([7, 12]))
     assert caught[1] < caught[0] < 1
     world.replace(np.array([7, 9, 11]), np.array([3, 12, 3]), world.keyframes)
-    np.testing.assert_array_equal(world.static_weight(np.array([3, 12, 4])), [*caught, 1])
+    np.testing.assert_array_equal(world.static_odds.weight(np.array([3, 12, 4])), [*caught, 1])
 
 
 def test_delayed_depth_is_moved_to_the_time_of_the_color_image() -> None:

@@ -1,4 +1,4 @@
-"""Corners of a rolling shutter, put where all rows at once would have seen them."""
+"""Correction of keypoints for a rolling shutter."""
 
 from dataclasses import replace
 
@@ -15,26 +15,26 @@ ROLLING = replace(CAMERA, readout_s=0.02)
 speeds = st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6)
 
 
-def seen(points: Array, twist: Array) -> Features:
-    """What a rolling shutter measures: every point at the moment at which its own row is read."""
-    late = np.zeros(len(points))
-    for _ in range(20):  # the row depends on the moment, and the moment on the row
+def rolling_shutter_features(points: Array, twist: Array) -> Features:
+    """Measure points with a rolling shutter, each at the time when its own row is read."""
+    delay_s = np.zeros(len(points))
+    for _ in range(20):  # the row depends on the time, and the time on the row
         local = np.concatenate(
             [
                 to_local(exp_se3(twist * t), point[None])
-                for t, point in zip(late, points, strict=True)
+                for t, point in zip(delay_s, points, strict=True)
             ]
         )
         pixels = CAMERA.project(local)
-        late = ROLLING.readout_s * (pixels[:, 1] / CAMERA.height - 0.5)
+        delay_s = ROLLING.readout_s * (pixels[:, 1] / CAMERA.height - 0.5)
     return features_at(pixels, local[:, 2])
 
 
 @given(speeds)
-def test_corners_are_where_the_middle_row_s_moment_has_them(speed: list[float]) -> None:
+def test_corrected_keypoints_equal_those_of_a_global_shutter(speed: list[float]) -> None:
     points = np.random.default_rng(0).uniform([-0.8, -0.6, 1.5], [0.8, 0.6, 3.0], (30, 3))
     twist = np.array(speed)
-    measured = seen(points, twist)
+    measured = rolling_shutter_features(points, twist)
     result = undo_rolling_shutter(measured, ROLLING, twist)
     np.testing.assert_allclose(result.undistorted, CAMERA.project(points), atol=0.03)
     np.testing.assert_allclose(result.depths, points[:, 2], atol=3e-4)
@@ -43,15 +43,17 @@ def test_corners_are_where_the_middle_row_s_moment_has_them(speed: list[float]) 
     )
 
 
-def test_a_corner_without_depth_moves_like_the_others() -> None:
+def test_keypoint_without_depth_moves_as_at_median_depth() -> None:
     points = np.random.default_rng(1).uniform([-0.8, -0.6, 1.9], [0.8, 0.6, 2.1], (30, 3))
     twist = np.array([0.5, 0.3, 0.0, 0.1, 0.6, 0.2])
-    measured = seen(points, twist)
-    blind = replace(measured, depths=np.where(np.arange(30) % 3 == 0, np.nan, measured.depths))
-    result = undo_rolling_shutter(blind, ROLLING, twist)
+    measured = rolling_shutter_features(points, twist)
+    partly_without_depth = replace(
+        measured, depths=np.where(np.arange(30) % 3 == 0, np.nan, measured.depths)
+    )
+    result = undo_rolling_shutter(partly_without_depth, ROLLING, twist)
     assert np.isnan(result.depths).sum() == 10
     np.testing.assert_allclose(result.undistorted, CAMERA.project(points), atol=0.1)
-    nothing = replace(measured, depths=np.full(30, np.nan))
+    without_depth = replace(measured, depths=np.full(30, np.nan))
     np.testing.assert_array_equal(
-        undo_rolling_shutter(nothing, ROLLING, twist).undistorted, measured.undistorted
+        undo_rolling_shutter(without_depth, ROLLING, twist).undistorted, measured.undistorted
     )

@@ -9,7 +9,7 @@ from cohdc_train.trajectory.trajectory import Trajectory
 
 
 def record(is_keyframe: bool, mapping_ms: float) -> FrameRecord:
-    """A tracked frame that took 10 ms to track."""
+    """Return the record of a tracked frame that took 10 ms to track."""
     timing = FrameTiming(tracking_ms=10.0, mapping_ms=mapping_ms)
     return FrameRecord("0", True, is_keyframe, 100, 90, 0.0, timing)
 

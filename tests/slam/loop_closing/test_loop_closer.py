@@ -17,7 +17,7 @@ from cohdc_train.slam.loop_closing.verification import (
     LoopVerifierConfig,
 )
 from cohdc_train.slam.mapping.global_bundle_adjustment import adjust_everything
-from cohdc_train.slam.mapping.keyframe import Keyframe, observations
+from cohdc_train.slam.mapping.keyframe import Keyframe, observations_at
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.optimization.reprojection import ReprojectionModel, chi_square
 from cohdc_train.slam.system import Slam
@@ -110,7 +110,7 @@ def mean_error(point_map: Map) -> float:
     squares = []
     for keyframe in point_map.keyframes:
         keypoints = np.flatnonzero(keyframe.point_ids >= 0)
-        observed = observations(keyframe.features, keypoints)
+        observed = observations_at(keyframe.features, keypoints)
         points = point_map.positions[keyframe.point_ids[keypoints]]
         squares.append(chi_square(keyframe.T_cw, points, observed, REPROJECTION))
     return float(np.minimum(np.concatenate(squares), 10.0).mean())

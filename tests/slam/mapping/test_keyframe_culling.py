@@ -1,6 +1,4 @@
-"""A map that grows with the room, not with time; and what may never be lost when keyframes and
-points go.
-"""
+"""Keyframe culling: bounded map, and consistent map after removals."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -25,7 +23,7 @@ from cohdc_train.slam.tracking.keyframe_policy import KeyframePolicy
 from cohdc_train.trajectory.evaluate import score
 from cohdc_train.trajectory.trajectory import Trajectory
 
-ROUND = 20  # frames until the hand is back
+ROUND = 20  # frames until the camera is back
 ROUNDS = 4
 PATH = camera_path(60)[::3]
 CULLING = KeyframeCullingConfig()
@@ -34,8 +32,9 @@ WINDOW = ADJUSTMENT.local_keyframes
 
 
 def sway(rounds: int, **options: object) -> Slam:
-    """A hand that sways before the room, every second frame a keyframe; the end of each round is
-    its beginning.
+    """Track a camera that sways in front of a room, with every second frame a keyframe.
+
+    Each round ends where it began.
     """
     config = slam_config(
         250,
@@ -63,22 +62,20 @@ def never_culled() -> Slam:
 
 @pytest.fixture
 def whole(never_culled: Slam, monkeypatch: pytest.MonkeyPatch) -> Slam:
-    """The same with a map to spoil."""
+    """Return the run without culling, with a copy of its map that a test may change."""
     monkeypatch.setattr(never_culled, "map", deepcopy(never_culled.map))
     return never_culled
 
 
-def test_the_map_of_a_known_room_stops_growing(culled: Slam, never_culled: Slam) -> None:
+def test_map_of_known_room_stops_growing(culled: Slam, never_culled: Slam) -> None:
     assert len(never_culled.map.keyframes) == never_culled.map.num_inserted >= ROUNDS * ROUND / 2
     assert len(culled.map.keyframes) < 0.6 * len(never_culled.map.keyframes)
     assert len(culled.map.keyframes) <= len(sway(ROUNDS - 2).map.keyframes) + 2
     assert ate(culled) < max(1.2 * ate(never_culled), 0.004)
 
 
-def test_patches_are_bounded_with_the_points() -> None:
-    """Refinement keeps one per row of the map; a point whose first keyframe has gone is still
-    refined.
-    """
+def test_number_of_patches_is_bounded_by_number_of_points() -> None:
+    """Refinement stores a patch per row, and refines points whose first keyframe was removed."""
     slam = sway(2)
     assert slam.tracker.parts.refiner is not None
     assert slam.map.num_inserted > len(slam.map.keyframes)
@@ -87,10 +84,8 @@ def test_patches_are_bounded_with_the_points() -> None:
 
 
 @pytest.mark.slow
-def test_a_known_place_needs_no_keyframe() -> None:
-    """Twelve keyframes at one place, a hand that then holds still: at 30 frames/s the clock alone
-    would ask for six.
-    """
+def test_static_camera_at_known_place_adds_no_keyframe() -> None:
+    """After twelve keyframes at one place, the frame interval alone would ask for six more."""
     rgb, depth, _ = render(room(), PATH[0])
     slam = Slam(CAMERA, slam_config(250))
     parts = slam.tracker.parts
@@ -106,36 +101,36 @@ def test_a_known_place_needs_no_keyframe() -> None:
         render(room(), exp_se3(np.array([0.03 * k, 0.0, 0.0, 0.0, 0.0, 0.0])))[:2]
         for k in range(30)
     ]
-    aside = [track(slam, *view, 5 + k / 30) for k, view in enumerate(views)]
-    assert all(pose.is_tracked for pose in aside)
-    assert any(pose.is_keyframe for pose in aside), (
-        "what comes into view beside it is taken into the map"
+    sideways = [track(slam, *view, 5 + k / 30) for k, view in enumerate(views)]
+    assert all(pose.is_tracked for pose in sideways)
+    assert any(pose.is_keyframe for pose in sideways), (
+        "new places next to the known one are added to the map"
     )
 
 
 def ate(slam: Slam) -> float:
-    """RMSE, m; every frame must have a pose."""
+    """Return the RMSE, m; every frame must have a pose."""
     estimate = slam.trajectory()
     assert len(estimate) == ROUNDS * ROUND
     truth = Trajectory(np.arange(ROUNDS * ROUND) / 30, np.tile(PATH, (ROUNDS, 1, 1)))
     return score(truth, estimate)["ate_m"]["rmse"]
 
 
-def test_the_books_are_right_after_many_removals(culled: Slam) -> None:
+def test_observers_are_consistent_after_culling(culled: Slam) -> None:
     world = culled.map
     assert world.num_inserted > len(world.keyframes)
-    seen = [keyframe.observed_point_ids() for keyframe in world.keyframes]
-    counts = np.bincount(np.concatenate(seen), minlength=world.size)
+    observed = [keyframe.observed_point_ids() for keyframe in world.keyframes]
+    counts = np.bincount(np.concatenate(observed), minlength=world.size)
     np.testing.assert_array_equal(world.num_observations[: world.size], counts)
     there = {keyframe.index for keyframe in world.keyframes}
     remembered = np.unique(world.observers[: world.size]) - 1
     assert set(remembered.tolist()) <= there | {-1}
     assert world.keyframes[0].index == 0
     assert [keyframe.index for keyframe in world.keyframes] == sorted(there)
-    assert world.size < 2 * np.count_nonzero(counts), "new points take the rows of former ones"
+    assert world.size < 2 * np.count_nonzero(counts), "new points reuse the rows of removed ones"
 
 
-def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Slam) -> None:
+def test_frames_and_points_stay_in_place_when_keyframe_is_removed(whole: Slam) -> None:
     world, T_cw = whole.map, exp_se3(np.array([0.1, 0.0, 0.1, 0.0, 0.1, 0.0]))
     stamps, before = whole.trajectory().timestamps, whole.trajectory().poses
     removed = cull_keyframes(world, world.keyframes[-1], set(), CULLING, WINDOW)
@@ -151,7 +146,7 @@ def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Slam) -> No
     step = exp_se3(np.array([0.02, 0.01, 0.0, 0.01, 0.0, 0.02]))
     world.move(
         np.stack([k.T_cw for k in world.keyframes]) @ np.linalg.inv(step)
-    )  # as a loop moves it
+    )  # as loop closure does
     np.testing.assert_allclose(
         world.positions[first_keyframe], places @ step[:3, :3].T + step[:3, 3], atol=1e-9
     )
@@ -161,7 +156,7 @@ def test_what_hangs_on_a_keyframe_that_goes_stays_where_it_is(whole: Slam) -> No
     )
 
 
-def test_some_keyframes_never_go(whole: Slam) -> None:
+def test_protected_keyframes_are_never_culled(whole: Slam) -> None:
     world = whole.map
     newest = world.keyframes[-1]
     window = {keyframe.index for keyframe in world.covisible(newest.observed_point_ids(), WINDOW)}
@@ -176,7 +171,7 @@ def test_some_keyframes_never_go(whole: Slam) -> None:
     assert not removed & (window | kept | {0, newest.index})
 
 
-def test_a_window_under_way_moves_no_point_that_took_a_row_meanwhile(whole: Slam) -> None:
+def test_running_adjustment_does_not_move_point_in_reused_row(whole: Slam) -> None:
     world = whole.map
     newest, features = world.keyframes[-1], world.keyframes[-1].features
     window = build_window(world, newest, ADJUSTMENT)
@@ -194,16 +189,14 @@ def test_a_window_under_way_moves_no_point_that_took_a_row_meanwhile(whole: Slam
 
 
 def keyframe_like(world: Map, keyframe: Keyframe) -> Keyframe:
-    """A new one at the same place that sees no point yet."""
-    free, pictures = (
-        np.full(len(keyframe.features), -1),
-        (keyframe.thumbnail, keyframe.min_depth_grid),
-    )
+    """Return a new keyframe at the same place that observes no point yet."""
+    free = np.full(len(keyframe.features), -1)
+    images = (keyframe.thumbnail, keyframe.min_depth_grid)
     return Keyframe(
         world.num_inserted,
         keyframe.timestamp + 1,
         keyframe.T_cw.copy(),
         keyframe.features,
         free,
-        *pictures,
+        *images,
     )

@@ -1,4 +1,4 @@
-"""Which young points stay in the map."""
+"""Merging, culling, and removal of map points."""
 
 import numpy as np
 from plane_world import CAMERA, features_at
@@ -7,23 +7,22 @@ from cohdc_train.slam.mapping.keyframe import Keyframe
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.mapping.map_points import cull_map_points, remove_points
 
-ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, by what becomes of them
+ONCE, TWICE, RARELY_FOUND, YOUNG = range(4)  # points, named by what happens to them
 
 
 def keyframe(index: int, point_ids: list[int]) -> Keyframe:
-    """One that looks at a wall 2 m away, a corner for each of four points; -1 where it does not see
-    one.
+    """Return a keyframe in front of a wall at 2 m, with a keypoint for each of four points.
+
+    point_ids: -1 = not observed.
     """
     pixels = np.array([[100.0, 80.0], [200.0, 80.0], [100.0, 160.0], [200.0, 160.0]])
     features = features_at(pixels, np.full(4, 2.0))
-    picture = np.zeros((2, 2), dtype=np.float32)
-    return Keyframe(index, index / 3, np.eye(4), features, np.array(point_ids), picture, picture)
+    image = np.zeros((2, 2), dtype=np.float32)
+    return Keyframe(index, index / 3, np.eye(4), features, np.array(point_ids), image, image)
 
 
-def test_what_a_point_has_become() -> None:
-    """The last of three is taken over by the second, and that by the first; later a new point has
-    the first's row.
-    """
+def test_merged_points_resolve_to_their_successor() -> None:
+    """Point 2 is merged into 1, and 1 into 0; later a new point reuses row 0."""
     world = Map(CAMERA)
     frames = [keyframe(index, [-1, -1, -1, -1]) for index in range(4)]
     for index in range(3):
@@ -42,7 +41,7 @@ def test_what_a_point_has_become() -> None:
     np.testing.assert_array_equal(world.resolve_merged(everything), [0, 1, 1])
 
 
-def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
+def test_point_stays_if_two_keyframes_observe_it_and_frames_match_it() -> None:
     world = Map(CAMERA)
     first, second = keyframe(0, [-1, -1, -1, -1]), keyframe(1, [-1, TWICE, RARELY_FOUND, -1])
     world.add_keyframe(first)
@@ -51,14 +50,16 @@ def test_a_point_stays_when_two_keyframes_see_it_and_frames_find_it() -> None:
     world.add_points(second, np.array([YOUNG]))
     world.visible[[TWICE, RARELY_FOUND]], world.found[[TWICE, RARELY_FOUND]] = 20, (5, 4)
     cull_map_points(world, newest=2)
-    assert world.num_observations[: world.size].tolist() == [1, 2, 0, 1], "its time is not up"
+    assert world.num_observations[: world.size].tolist() == [1, 2, 0, 1], (
+        "its probation has not ended"
+    )
     cull_map_points(world, newest=3)
     assert world.num_observations[: world.size].tolist() == [0, 2, 0, 1]
     assert first.point_ids.tolist() == [-1, TWICE, -1, -1]
 
 
-def test_dropped_point_leaves_every_keyframe_however_many_saw_it() -> None:
-    """A point remembers eight observers; the drop reaches the other four too."""
+def test_removed_point_is_forgotten_by_all_keyframes() -> None:
+    """A point stores eight observers; removal reaches the other four as well."""
     world = Map(CAMERA)
     keyframes = [
         keyframe(0, [-1, -1, -1, -1]),
@@ -74,7 +75,7 @@ def test_dropped_point_leaves_every_keyframe_however_many_saw_it() -> None:
     assert all(other.point_ids[0] == -1 for other in keyframes)
 
 
-def test_grown_map_has_no_merged_points_in_its_new_rows() -> None:
+def test_new_rows_of_grown_map_have_no_merged_points() -> None:
     world = Map(CAMERA)
     world._reserve(3000)
     np.testing.assert_array_equal(world.merged_into, -1)

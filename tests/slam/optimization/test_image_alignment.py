@@ -16,7 +16,7 @@ PATH = camera_path(20)
 CONFIG = LoopVerificationConfig()
 
 
-def picture(
+def depth_image(
     T_wc: Array, rectangles: list[Rectangle] | None = None, gain: float = 1.0
 ) -> DepthImage:
     rgb, depth, moving = render(rectangles or room(), T_wc)
@@ -24,7 +24,7 @@ def picture(
 
 
 @given(st.integers(0, 10_000))
-def test_the_warps_jacobian_equals_differences(seed: int) -> None:
+def test_warp_jacobian_equals_finite_differences(seed: int) -> None:
     points = np.random.default_rng(seed).uniform([-1, -0.7, 1], [1, 0.7, 4], size=(5, 3))
     jacobian = warp_jacobian(points, CAMERA)
     for axis in range(6):
@@ -39,23 +39,25 @@ def test_the_warps_jacobian_equals_differences(seed: int) -> None:
 
 @settings(max_examples=8)
 @given(st.integers(0, 1000))
-def test_a_small_motion_is_recovered(seed: int) -> None:
+def test_alignment_recovers_small_motion(seed: int) -> None:
     off = np.random.default_rng(seed).uniform(-1, 1, 6) * np.repeat(
         [0.03, 0.015], 3
-    )  # 3 cm, 0.9 degrees per axis
+    )  # 3 cm and 0.9 degrees per axis
     truth = inverse(PATH[19]) @ PATH[0]
-    found = align(picture(PATH[0]), picture(PATH[19], gain=0.8), exp_se3(off) @ truth, CONFIG)
+    found = align(
+        depth_image(PATH[0]), depth_image(PATH[19], gain=0.8), exp_se3(off) @ truth, CONFIG
+    )
     assert found is not None
-    rest = found.T @ inverse(truth)
-    assert np.linalg.norm(rest[:3, 3]) < 0.003
-    assert np.abs(rest[:3, :3] - np.eye(3)).max() < 0.0015
+    remaining = found.T @ inverse(truth)
+    assert np.linalg.norm(remaining[:3, 3]) < 0.003
+    assert np.abs(remaining[:3, :3] - np.eye(3)).max() < 0.0015
     assert found.after < 0.5 * found.before
     assert found.correlation > 0.97
     assert found.overlap > 0.5
     assert found.agreement > 0.95
 
 
-def test_the_same_poster_before_another_wall_does_not_correlate() -> None:
+def test_same_object_in_front_of_another_wall_does_not_correlate() -> None:
     rng = np.random.default_rng(5)
     poster = Rectangle(
         np.array([-0.5, -0.6, 2.5]),
@@ -72,7 +74,7 @@ def test_the_same_poster_before_another_wall_does_not_correlate() -> None:
         )
         for _ in range(2)
     ]
-    views = [picture(np.eye(4), [poster, wall]) for wall in walls]
+    views = [depth_image(np.eye(4), [poster, wall]) for wall in walls]
     same, other = (align(views[0], views[k], np.eye(4), CONFIG) for k in (0, 1))
     assert same is not None
     assert other is not None
@@ -80,6 +82,6 @@ def test_the_same_poster_before_another_wall_does_not_correlate() -> None:
     assert other.correlation < 0.5
 
 
-def test_pictures_that_see_nothing_in_common_are_refused() -> None:
+def test_images_without_overlap_are_refused() -> None:
     away = exp_se3(np.array([0.0, 0, 0, 0, np.pi / 2, 0]))
-    assert align(picture(PATH[0]), picture(PATH[0]), away, CONFIG) is None
+    assert align(depth_image(PATH[0]), depth_image(PATH[0]), away, CONFIG) is None

@@ -25,8 +25,9 @@ def noisy(T: Array, rng: np.random.Generator) -> Array:
 
 
 def square(per_side: int = 12, laps: int = 2, step: float = 0.5) -> Array:
-    """[n, 4, 4] T_cw of a camera that walks round a square, turning its view by 90 degrees along
-    each side.
+    """Return poses [n, 4, 4] T_cw of a camera that moves around a square.
+
+    It turns by 90 degrees along each side.
     """
     motion = exp_se3(np.array([0.0, 0.0, -step, 0.0, -np.pi / 2 / per_side, 0.0]))
     poses = [np.eye(4)]
@@ -58,7 +59,7 @@ def error(poses: Array, truth: Array) -> float:
 
 
 def rounds(n: int, every: int = 6) -> list[tuple[int, int]]:
-    """Loops of the second lap with the first."""
+    """Return loops that connect the second lap with the first."""
     return [(k, k + n // 2) for k in range(0, n // 2, every)]
 
 
@@ -76,7 +77,7 @@ def test_logarithm_is_the_matrix_logarithm() -> None:
 
 @settings(max_examples=20)
 @given(st.integers(0, 10_000))
-def test_jacobians_equal_differences(seed: int) -> None:
+def test_jacobians_equal_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = exp_se3(rng.normal(size=(2, 6)) * 0.5)
     T = exp_se3(rng.normal(size=(1, 6)) * 0.02) @ poses[1:] @ inverse(poses[:1])
@@ -93,11 +94,11 @@ def test_jacobians_equal_differences(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_loops_take_out_the_drift(seed: int) -> None:
+def test_loops_remove_drift(seed: int) -> None:
     truth = square()
     drifted, edges = graph(truth, np.random.default_rng(seed), rounds(len(truth)))
     solved, weights = optimize_graph(drifted, edges, LoopConfig())
-    # What is left is the noise of one lap; two laps without a loop carry much more.
+    # The noise of one lap remains; two laps without a loop drift much further.
     exact = Edges(
         edges.first,
         edges.second,
@@ -113,9 +114,9 @@ def test_loops_take_out_the_drift(seed: int) -> None:
     np.testing.assert_array_equal(solved[0], drifted[0])
 
 
-def test_one_closing_of_a_square_takes_out_a_drift_in_yaw() -> None:
+def test_one_loop_around_a_square_removes_yaw_drift() -> None:
     truth = square(laps=1)
-    drift = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, -0.006, 0.0]))  # per step: 0.3 degrees too much
+    drift = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, -0.006, 0.0]))  # 0.3 degrees of drift per step
     motions = drift @ truth[1:] @ inverse(truth[:-1])
     drifted = [truth[0]]
     for motion in motions:
@@ -133,7 +134,7 @@ def test_one_closing_of_a_square_takes_out_a_drift_in_yaw() -> None:
     assert error(solved, truth) < error(poses, truth) / 5
 
 
-def test_a_wrong_loop_is_outweighed() -> None:
+def test_wrong_loop_loses_its_weight() -> None:
     truth = square()
     n = len(truth)
     drifted, right = graph(truth, np.random.default_rng(1), rounds(n))
@@ -152,6 +153,6 @@ def test_a_wrong_loop_is_outweighed() -> None:
     )
 
 
-def test_edges_refuse_shapes_that_differ() -> None:
+def test_edges_refuse_arrays_of_different_shape() -> None:
     with pytest.raises(ValueError, match="disagree"):
         Edges(np.array([0]), np.array([1]), np.eye(4)[None], np.ones((1, 3)), np.array([True]))

@@ -29,12 +29,12 @@ View = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    """A still room along a path."""
+    """Render the static room along a path."""
     return [render(room(), T_wc) for T_wc in camera_path(FRAMES)]
 
 
-class Watched:
-    """A slam in real time that says which frames were searched for corners."""
+class RecordedRun:
+    """Real-time SLAM that records in which frames keypoints are extracted."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, flow: bool = True, **options: object
@@ -46,44 +46,44 @@ class Watched:
             smoothing__enabled=False,
             **options,
         )
-        self.spent = 0.0
+        self.time_used = 0.0
         self.slam = Slam(
             CAMERA,
             config,
             executor=SynchronousExecutor(),
-            frame_time_used=lambda: self.spent,
+            frame_time_used=lambda: self.time_used,
         )
         self.searched: list[int] = []
         self.poses: list[FrameResult] = []
         find = self.slam.tracker.parts.extractor.find
 
-        def noted(*arguments: Any) -> Keypoints:
+        def record(*arguments: Any) -> Keypoints:
             self.searched.append(len(self.poses))
             return find(*arguments)
 
-        monkeypatch.setattr(self.slam.tracker.parts.extractor, "find", noted)
+        monkeypatch.setattr(self.slam.tracker.parts.extractor, "find", record)
 
     def track(self, view: View, mask: NDArray[np.bool_] | None = None) -> FrameResult:
         self.poses.append(track(self.slam, view[0], view[1], len(self.poses) / 30, mask))
         return self.poses[-1]
 
     def ate(self) -> float:
-        """RMSE, m."""
+        """Return the RMSE of the trajectory, m."""
         truth = Trajectory(np.arange(FRAMES) / 30, camera_path(FRAMES))
         return score(truth, self.slam.trajectory())["ate_m"]["rmse"]
 
 
-def test_two_of_three_frames_need_no_corners_and_are_as_exact(
+def test_flow_skips_keypoints_in_two_of_three_frames_without_loss_of_accuracy(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flow, matched = Watched(monkeypatch), Watched(monkeypatch, flow=False)
+    flow, matched = RecordedRun(monkeypatch), RecordedRun(monkeypatch, flow=False)
     for view in views:
         flow.track(view)
         matched.track(view)
         features = flow.poses[-1].features
         assert features is not None
         assert len(flow.poses) < 3 or features.is_subpixel.mean() > 0.3, (
-            "what a patch told is carried along"
+            "refined keypoints stay refined"
         )
     assert matched.searched == list(range(FRAMES))
     assert flow.searched == list(range(0, FRAMES, 3))
@@ -96,80 +96,82 @@ def test_two_of_three_frames_need_no_corners_and_are_as_exact(
     assert flow.ate() < 1.25 * matched.ate()
 
 
-def test_the_answer_by_flow_comes_before_the_frame_is_matched(
+def test_flow_pose_is_reported_before_matching(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Watched(monkeypatch)
-    slam, told = run.slam, list[FrameResult]()
+    run = RecordedRun(monkeypatch)
+    slam, reported = run.slam, list[FrameResult]()
     for index, view in enumerate(views[:13]):
         searched = len(run.searched)
 
-        def tell(pose: FrameResult, index: int = index, searched: int = searched) -> None:
-            told.append(pose)
-            assert index == 0 or len(run.searched) == searched, "nothing has been searched yet"
+        def report(pose: FrameResult, index: int = index, searched: int = searched) -> None:
+            reported.append(pose)
+            assert index == 0 or len(run.searched) == searched, (
+                "no keypoints have been extracted yet"
+            )
 
-        final = track(slam, view[0], view[1], index / 30, on_pose=tell)
-        assert len(told) == index + 1
-        assert told[-1].T_wc is not None
+        final = track(slam, view[0], view[1], index / 30, on_pose=report)
+        assert len(reported) == index + 1
+        assert reported[-1].T_wc is not None
         assert final.T_wc is not None
-        np.testing.assert_allclose(told[-1].T_wc, final.T_wc, atol=0.003)
-        assert told[-1].timing.tracking_ms == final.timing.tracking_ms
+        np.testing.assert_allclose(reported[-1].T_wc, final.T_wc, atol=0.003)
+        assert reported[-1].timing.tracking_ms == final.timing.tracking_ms
     assert len(run.searched) == 5
 
 
-def test_in_a_hurry_matching_and_mapping_wait_but_not_for_ever(
+def test_matching_and_mapping_are_postponed_for_limited_number_of_frames(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Watched(monkeypatch, keyframes__max_interval_frames=1)
-    work, worked = run.slam.tracker.parts.mapper.run_next_task, list[int]()
+    run = RecordedRun(monkeypatch, keyframes__max_interval_frames=1)
+    run_next_task, frames_with_task = run.slam.tracker.parts.mapper.run_next_task, list[int]()
 
-    def noted() -> None:
-        worked.append(len(run.poses))
-        work()
+    def record() -> None:
+        frames_with_task.append(len(run.poses))
+        run_next_task()
 
-    monkeypatch.setattr(run.slam.tracker.parts.mapper, "run_next_task", noted)
+    monkeypatch.setattr(run.slam.tracker.parts.mapper, "run_next_task", record)
     run.track(views[0])
-    run.spent = 0.8
+    run.time_used = 0.8
     for view in views[1:14]:
         assert run.track(view).is_tracked
     assert run.searched == [0, 6, 12]
-    assert worked == [6, 12], (
-        "in place of a keyframe, which waits until all is done for the one before"
+    assert frames_with_task == [6, 12], (
+        "tasks run in place of a keyframe, which waits for those of the one before"
     )
     assert [pose.is_keyframe for pose in run.poses] == [True] + [False] * 13
-    run.spent = 0.0
+    run.time_used = 0.0
     for view in views[14:20]:
         run.track(view)
     assert run.searched == [0, 6, 12, 15, 18]
-    assert worked == [6, 12, 14, 16, 17, 19]
+    assert frames_with_task == [6, 12, 14, 16, 17, 19]
     assert [index for index, pose in enumerate(run.poses) if pose.is_keyframe] == [0, 15, 18]
-    run.spent = 0.6
+    run.time_used = 0.6
     for view in views[20:22]:
         run.track(view)
-    assert worked[-2:] == [20, 21], "there is time for a part yet"
-    assert run.searched[-1] == 18, "but for no search"
+    assert frames_with_task[-2:] == [20, 21], "there is time for one task"
+    assert run.searched[-1] == 18, "but not for matching"
 
 
-def test_a_keyframes_upkeep_is_done_in_parts_while_flow_tracks(
+def test_mapping_tasks_run_one_per_frame_while_flow_tracks(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Watched(monkeypatch)
-    left, keyframes = [], []
+    run = RecordedRun(monkeypatch)
+    num_tasks, keyframes = [], []
     for view in views:
         keyframes.append(run.track(view).is_keyframe)
-        left.append(len(run.slam.tracker.parts.mapper._tasks))
+        num_tasks.append(len(run.slam.tracker.parts.mapper._tasks))
     newest = [index for index in np.flatnonzero(keyframes).tolist() if index < len(views) - 2]
     assert len(newest) >= 2
     for index in newest:
-        assert left[index : index + 3] == [2, 1, 0]
+        assert num_tasks[index : index + 3] == [2, 1, 0]
     run.slam.finish()
     assert not run.slam.tracker.parts.mapper._tasks
 
 
-def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become(
+def test_flow_tracks_merged_points_as_their_successor(
     views: list[View],
 ) -> None:
-    flow, slam, state = begun(views[0])
+    flow, slam, state = started_flow(views[0])
     first, state = flow.track_points(views[0][0], None, state, np.eye(4))
     is_subpixel = first.point_ids[first.keypoints.is_subpixel]
     old, new = is_subpixel[:1], is_subpixel[1:2]
@@ -180,48 +182,46 @@ def test_what_flow_follows_are_the_points_that_those_it_set_out_with_have_become
     slam.map.merged_into[old] = -1
 
 
-def test_of_many_points_a_frame_follows_every_second_and_the_next_the_others(
+def test_subsampled_flow_alternates_between_halves_of_points(
     views: list[View],
 ) -> None:
-    flow, slam, state = begun(views[0])
-    every, _ = flow.track_points(views[0][0], None, state, np.eye(4))
-    turns = FlowTracker(
+    flow, slam, state = started_flow(views[0])
+    all_tracks, _ = flow.track_points(views[0][0], None, state, np.eye(4))
+    subsampled = FlowTracker(
         slam.map,
         ReprojectionModel(CAMERA),
         slam.tracker.parts.measurer,
         FlowConfig(subsample_above=len(state.point_ids)),
     )
-    some, state = turns.track_points(views[0][0], None, state, np.eye(4))
-    others, _ = turns.track_points(views[0][0], None, state, np.eye(4))
-    ids = np.r_[some.point_ids, others.point_ids]
-    np.testing.assert_array_equal(np.sort(ids), every.point_ids)
-    assert 0.8 < len(some.point_ids) / len(others.point_ids) < 1.25
+    first_half, state = subsampled.track_points(views[0][0], None, state, np.eye(4))
+    second_half, _ = subsampled.track_points(views[0][0], None, state, np.eye(4))
+    ids = np.r_[first_half.point_ids, second_half.point_ids]
+    np.testing.assert_array_equal(np.sort(ids), all_tracks.point_ids)
+    assert 0.8 < len(first_half.point_ids) / len(second_half.point_ids) < 1.25
 
 
-def test_the_same_frames_give_the_same_bits(
-    views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ways = []
+def test_flow_is_deterministic(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    trajectories = []
     for _ in range(2):
-        run = Watched(monkeypatch)
+        run = RecordedRun(monkeypatch)
         for view in views[:12]:
             run.track(view)
-        ways.append(run.slam.trajectory().poses.tobytes())
-    assert ways[0] == ways[1]
+        trajectories.append(run.slam.trajectory().poses.tobytes())
+    assert trajectories[0] == trajectories[1]
 
 
-def test_flow_belongs_to_real_time() -> None:
+def test_flow_is_enabled_only_in_real_time() -> None:
     recorded = Slam(CAMERA, slam_config(500))
     live = Slam(CAMERA, slam_config(500), executor=SynchronousExecutor())
     assert recorded.tracker.parts.flow is None
     assert live.tracker.parts.flow is not None
 
 
-def test_where_flow_finds_too_little_the_frame_is_matched(
+def test_frame_is_matched_where_flow_fails(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A leap of ten frames lies beyond what flow can reach, but not beyond the map's."""
-    run = Watched(monkeypatch)
+    """A jump of ten frames is too far for flow, but not for matching with the map."""
+    run = RecordedRun(monkeypatch)
     for view in views[:4]:
         run.track(view)
     motion = run.slam.tracker.parts.motion
@@ -229,16 +229,14 @@ def test_where_flow_finds_too_little_the_frame_is_matched(
     motion._state.velocity[:] = 0
     assert run.track(views[20]).is_tracked
     assert 4 in run.searched
-    found = run.poses[-1].T_wc
-    assert found is not None
+    T_wc = run.poses[-1].T_wc
+    assert T_wc is not None
     relative = np.linalg.inv(camera_path(FRAMES)[0]) @ camera_path(FRAMES)[20]
-    np.testing.assert_allclose(found[:3, 3], relative[:3, 3], atol=0.01)
+    np.testing.assert_allclose(T_wc[:3, 3], relative[:3, 3], atol=0.01)
 
 
-def test_a_lost_place_is_followed_by_no_flow(
-    views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = Watched(monkeypatch)
+def test_flow_does_not_start_after_loss(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    run = RecordedRun(monkeypatch)
     nothing = np.zeros_like(views[0][0]), np.zeros_like(views[0][1]), views[0][2]
     states = [
         run.track(nothing if index in (4, 5) else view).is_tracked
@@ -248,11 +246,11 @@ def test_a_lost_place_is_followed_by_no_flow(
     assert run.searched[:5] == [0, 3, 4, 5, 6]
 
 
-def test_nothing_is_followed_under_a_mask_and_a_passer_by_does_not_drag_the_pose(
+def test_flow_ignores_masked_points_and_unmasked_person(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """He is masked when frames are matched, but walks over points that flow follows."""
-    run, path = Watched(monkeypatch), camera_path(FRAMES)
+    """The person is masked in matched frames, but occludes points that flow tracks."""
+    run, path = RecordedRun(monkeypatch), camera_path(FRAMES)
     under_mask = 0
     for index in range(FRAMES):
         view = render([*room(), passer_by(index)], path[index])
@@ -267,16 +265,16 @@ def test_nothing_is_followed_under_a_mask_and_a_passer_by_does_not_drag_the_pose
     assert run.ate() < 0.005
 
 
-def test_flow_sets_out_from_where_the_motion_leads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wall moves by 20 px from frame to frame, and by 40 until the next matched one."""
+def test_flow_starts_from_predicted_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wall moves by 20 px per frame, and by 40 px until the next matched frame."""
     path = exp_se3(np.outer(np.arange(10) - 5, [0.18, 0.0, 0.01, 0.0, 0.01, 0.0]))
-    run = Watched(monkeypatch)
+    run = RecordedRun(monkeypatch)
     assert all(run.track(render(room(), T_wc)).is_tracked for T_wc in path)
-    assert run.searched == [0, 1, 4, 7], "the first motion is known to nobody"
+    assert run.searched == [0, 1, 4, 7], "the first motion cannot be predicted"
 
 
-def begun(view: View) -> tuple[FlowTracker, Slam, FlowState]:
-    """A flow that starts from the first frame of a map."""
+def started_flow(view: View) -> tuple[FlowTracker, Slam, FlowState]:
+    """Start flow from the first frame of a map."""
     slam = Slam(CAMERA, slam_config(500), executor=SynchronousExecutor())
     track(slam, view[0], view[1], 0.0)
     assert slam.tracker.parts.flow is not None
@@ -284,8 +282,8 @@ def begun(view: View) -> tuple[FlowTracker, Slam, FlowState]:
     return slam.tracker.parts.flow, slam, slam.tracker.state.flow
 
 
-def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
-    flow, slam, state = begun(views[0])
+def test_flow_pose_needs_enough_inliers(views: list[View]) -> None:
+    flow, slam, state = started_flow(views[0])
     tracks, state = flow.track_points(views[0][0], None, state, np.eye(4))
     features = slam.tracker.parts.extractor.measure(tracks.keypoints, views[0][1])
     estimate, _ = flow.estimate_pose(tracks, FrameFeatures(features, None), state, STILL)
@@ -298,28 +296,29 @@ def test_most_of_the_points_that_set_out_must_agree(views: list[View]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("found", "answers", "over"), [(0.7, True, False), (0.5, True, True), (0.3, False, True)]
+    ("ratio", "has_pose", "needs_match"),
+    [(0.7, True, False), (0.5, True, True), (0.3, False, True)],
 )
-def test_a_frame_in_which_flow_loses_many_points_is_matched_after_the_answer(
-    views: list[View], found: float, answers: bool, over: bool
+def test_frame_in_which_flow_loses_points_is_matched(
+    views: list[View], ratio: float, has_pose: bool, needs_match: bool
 ) -> None:
-    flow, slam, state = begun(views[0])
+    flow, slam, state = started_flow(views[0])
     tracks, state = flow.track_points(views[0][0], None, state, np.eye(4))
-    some = np.arange(round(found * len(tracks.point_ids)))
-    left = FlowTracks(tracks.point_ids[some], tracks.keypoints.take(some))
-    features = slam.tracker.parts.extractor.measure(left.keypoints, views[0][1])
-    estimate, state = flow.estimate_pose(left, FrameFeatures(features, None), state, STILL)
-    assert (estimate is not None) == answers
+    kept = np.arange(round(ratio * len(tracks.point_ids)))
+    remaining = FlowTracks(tracks.point_ids[kept], tracks.keypoints.take(kept))
+    features = slam.tracker.parts.extractor.measure(remaining.keypoints, views[0][1])
+    estimate, state = flow.estimate_pose(remaining, FrameFeatures(features, None), state, STILL)
+    assert (estimate is not None) == has_pose
     if estimate is not None:
         np.testing.assert_allclose(estimate.T_cw, np.eye(4), atol=1e-4)
-        assert flow.needs_match(state, in_hurry=False, mapper_is_busy=False) == over
+        assert flow.needs_match(state, in_hurry=False, mapper_is_busy=False) == needs_match
         assert not flow.needs_match(state, in_hurry=True, mapper_is_busy=False)
-        assert flow.needs_match(state, in_hurry=False, mapper_is_busy=True) == over
-        assert state.tracked_ratio == pytest.approx(found, abs=0.02)
+        assert flow.needs_match(state, in_hurry=False, mapper_is_busy=True) == needs_match
+        assert state.tracked_ratio == pytest.approx(ratio, abs=0.02)
 
 
-def test_no_flow_starts_from_a_frame_with_few_matches(views: list[View]) -> None:
-    flow, slam, _ = begun(views[0])
+def test_flow_does_not_start_from_frame_with_few_matches(views: list[View]) -> None:
+    flow, slam, _ = started_flow(views[0])
     last = slam.tracker.state.last
     assert last is not None
     few = replace(last, matches=last.matches.take(np.arange(49)))
@@ -327,11 +326,9 @@ def test_no_flow_starts_from_a_frame_with_few_matches(views: list[View]) -> None
     assert flow.start(views[1][0], last, None) is not None
 
 
-def test_what_is_at_rest_under_its_mask_is_followed_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of a still room is called a person, who after two seconds is taken to be seated: frames
-    70 and later.
-    """
-    run, mask = Watched(monkeypatch), np.zeros((240, 320), dtype=np.bool_)
+def test_static_object_is_tracked_under_its_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mask covers most of a static room, which counts as static after two seconds."""
+    run, mask = RecordedRun(monkeypatch), np.zeros((240, 320), dtype=np.bool_)
     mask[:, :230] = True
     view = render(room(), np.eye(4))
     for _ in range(96):
@@ -345,34 +342,34 @@ def test_what_is_at_rest_under_its_mask_is_followed_there(monkeypatch: pytest.Mo
     assert np.count_nonzero(features.pixels[:, 0] < 225) > 100
 
 
-def test_few_points_are_weighed_against_what_was_expected(views: list[View]) -> None:
-    flow, slam, state = begun(views[0])
+def test_motion_prior_counts_with_few_points(views: list[View]) -> None:
+    flow, slam, state = started_flow(views[0])
     tracks, _ = flow.track_points(views[0][0], None, state, np.eye(4))
     measure = slam.tracker.parts.extractor.measure
     features = FrameFeatures(measure(tracks.keypoints, views[0][1]), None)
     assert slam.tracker.state.last is not None
-    some = np.arange(100)
-    matches = Matches(tracks.point_ids[some], some)
+    rows = np.arange(100)
+    matches = Matches(tracks.point_ids[rows], rows)
     few = replace(slam.tracker.state.last, matches=matches, frame_features=features)
     started = flow.start(views[0][0], few, None)
     assert started is not None
     again, started = flow.track_points(views[0][0], None, started, np.eye(4))
     steady = Prediction(Prior(np.eye(4), 1e12 * np.eye(6)), True, 150)
-    seen = measure(again.keypoints, views[0][1])
-    moved = FrameFeatures(replace(seen, undistorted=seen.undistorted + 0.5), None)
-    weighed, _ = flow.estimate_pose(again, moved, started, steady)
-    alone, _ = flow.estimate_pose(again, moved, started, STILL)
-    assert weighed is not None
-    assert alone is not None
-    assert (weighed.prior_gradient.any(), alone.prior_gradient.any()) == (True, False)
-    np.testing.assert_allclose(weighed.T_cw, np.eye(4), atol=1e-5)
-    assert np.abs(alone.T_cw - np.eye(4)).max() > 1e-3
+    measured = measure(again.keypoints, views[0][1])
+    moved = FrameFeatures(replace(measured, undistorted=measured.undistorted + 0.5), None)
+    with_prior, _ = flow.estimate_pose(again, moved, started, steady)
+    without_prior, _ = flow.estimate_pose(again, moved, started, STILL)
+    assert with_prior is not None
+    assert without_prior is not None
+    assert (with_prior.prior_gradient.any(), without_prior.prior_gradient.any()) == (True, False)
+    np.testing.assert_allclose(with_prior.T_cw, np.eye(4), atol=1e-5)
+    assert np.abs(without_prior.T_cw - np.eye(4)).max() > 1e-3
 
 
-def test_the_motion_moves_along_with_the_map_and_ends_with_a_loss(
+def test_motion_model_moves_with_map_and_resets_on_loss(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, shift = Watched(monkeypatch), exp_se3(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0]))
+    run, shift = RecordedRun(monkeypatch), exp_se3(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0]))
     for view in views[:6]:
         run.track(view)
     tracker, point_map = run.slam.tracker, run.slam.map

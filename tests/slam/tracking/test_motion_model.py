@@ -1,4 +1,4 @@
-"""Motion model: prediction of the pose, and the prior that it gives."""
+"""Motion model: predicted pose, and the prior that it provides."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +15,18 @@ from cohdc_train.trajectory.trajectory import Trajectory
 
 CONFIG = MotionModelConfig()
 ACCELERATION = np.repeat(CONFIG.acceleration_sigma, 3)
-SURE = 1e12 * np.eye(6)
+CERTAIN = 1e12 * np.eye(6)
 VELOCITY = np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.3])  # m/s, rad/s
 STEP = 1 / 30
 
 
 def at(t: float) -> NDArray[np.float64]:
-    """T_cw at t of a camera that keeps its velocity."""
+    """Return T_cw at time t of a camera with constant velocity."""
     return exp_se3(VELOCITY * t)
 
 
 def predict(motion: MotionModel, t: float) -> Prediction:
-    """The prediction of a model that has one."""
+    """Return the prediction of a model that is initialized."""
     prediction = motion.predict(t)
     assert prediction is not None
     return prediction
@@ -35,11 +35,11 @@ def predict(motion: MotionModel, t: float) -> Prediction:
 def moved(times: list[float]) -> MotionModel:
     motion = MotionModel()
     for t in times:
-        motion.update(t, at(t), SURE)
+        motion.update(t, at(t), CERTAIN)
     return motion
 
 
-def test_a_steady_motion_goes_on_over_uneven_steps() -> None:
+def test_constant_velocity_is_predicted_over_uneven_steps() -> None:
     times = [0.0, 0.03, 0.07, 0.1, 0.13, 0.2, 0.23, 0.27, 0.3, 0.33, 0.37]
     motion = moved(times)
     assert motion.twist is not None
@@ -47,7 +47,7 @@ def test_a_steady_motion_goes_on_over_uneven_steps() -> None:
     np.testing.assert_allclose(predict(motion, 0.47).prior.T_cw, at(0.47), atol=3e-4)
 
 
-def test_after_a_long_pause_the_camera_is_not_held_to_have_gone_on_for_ever() -> None:
+def test_prediction_stops_after_longest_gap() -> None:
     motion = moved([k * STEP for k in range(12)])
     last = 11 * STEP
     far, farther = predict(motion, last + 2.0).prior, predict(motion, last + 4.0).prior
@@ -56,19 +56,19 @@ def test_after_a_long_pause_the_camera_is_not_held_to_have_gone_on_for_ever() ->
     assert np.all(np.diag(farther.information) < np.diag(far.information))
 
 
-def test_nothing_is_known_before_two_frames_nor_after_a_loss() -> None:
+def test_velocity_is_unknown_before_two_frames_and_after_reset() -> None:
     motion = MotionModel()
     assert motion.twist is None
-    motion.update(0.0, np.eye(4), SURE)
+    motion.update(0.0, np.eye(4), CERTAIN)
     assert motion.twist is None
     np.testing.assert_allclose(predict(motion, STEP).prior.T_cw, np.eye(4))
-    motion.update(STEP, at(STEP), SURE)
+    motion.update(STEP, at(STEP), CERTAIN)
     assert motion.twist is not None
     motion.reset()
     assert motion.twist is None
 
 
-def test_the_motion_goes_along_when_the_map_moves() -> None:
+def test_prediction_moves_with_map() -> None:
     motion, shift = (
         moved([k * STEP for k in range(12)]),
         exp_se3(np.array([0.5, 0.1, -0.3, 0.2, -0.4, 0.3])),
@@ -80,30 +80,32 @@ def test_the_motion_goes_along_when_the_map_moves() -> None:
     np.testing.assert_allclose(after.information, before.information)
 
 
-def test_a_leap_is_believed_and_the_velocity_is_then_unknown_again() -> None:
+def test_jump_is_accepted_and_velocity_becomes_unknown() -> None:
     motion = moved([k * STEP for k in range(12)])
-    sure = np.diag(predict(motion, 12 * STEP).prior.information)
-    motion.update(12 * STEP, exp_se3(np.array([0.3, 0, 0, 0, 0, 0])) @ at(12 * STEP), SURE)
+    information_before = np.diag(predict(motion, 12 * STEP).prior.information)
+    motion.update(12 * STEP, exp_se3(np.array([0.3, 0, 0, 0, 0, 0])) @ at(12 * STEP), CERTAIN)
     assert motion.twist is None
-    unsure = predict(motion, 13 * STEP).prior
-    assert np.all(np.diag(unsure.information) < sure / 20)
-    np.testing.assert_allclose(unsure.T_cw, exp_se3(np.array([0.3, 0, 0, 0, 0, 0])) @ at(12 * STEP))
+    after_jump = predict(motion, 13 * STEP).prior
+    assert np.all(np.diag(after_jump.information) < information_before / 20)
+    np.testing.assert_allclose(
+        after_jump.T_cw, exp_se3(np.array([0.3, 0, 0, 0, 0, 0])) @ at(12 * STEP)
+    )
 
 
-def test_a_start_that_a_hand_can_make_gives_a_velocity_at_once() -> None:
+def test_plausible_start_gives_velocity_after_one_step() -> None:
     motion = MotionModel()
     for k in range(12):
-        motion.update(k * STEP, np.eye(4), SURE)
+        motion.update(k * STEP, np.eye(4), CERTAIN)
     start = np.array([0.05, 0, 0, 0, 0, 0.04])
-    motion.update(12 * STEP, exp_se3(start), SURE)
+    motion.update(12 * STEP, exp_se3(start), CERTAIN)
     assert motion.twist is not None
     np.testing.assert_allclose(motion.twist, start / STEP, atol=0.02)
 
 
-def test_two_frames_of_one_stamp_leave_all_numbers_finite() -> None:
+def test_equal_timestamps_give_finite_prediction() -> None:
     motion = moved([k * STEP for k in range(12)])
-    for leap in (0.0, 0.3):
-        motion.update(11 * STEP, exp_se3(np.array([leap, 0, 0, 0, 0, 0])) @ at(11 * STEP), SURE)
+    for jump in (0.0, 0.3):
+        motion.update(11 * STEP, exp_se3(np.array([jump, 0, 0, 0, 0, 0])) @ at(11 * STEP), CERTAIN)
         assert motion.twist is None
         assert np.isfinite(predict(motion, 11 * STEP).prior.information).all()
         np.testing.assert_allclose(
@@ -111,57 +113,56 @@ def test_two_frames_of_one_stamp_leave_all_numbers_finite() -> None:
         )
 
 
-def test_a_clock_that_leaps_breaks_nothing() -> None:
-    for leap in (1e7, -1e4):
+def test_jump_of_timestamps_gives_finite_prediction() -> None:
+    for jump in (1e7, -1e4):
         motion = moved([k * STEP for k in range(12)])
         for k in range(4):
-            expected = predict(motion, 11 * STEP + leap + k * STEP).prior
+            expected = predict(motion, 11 * STEP + jump + k * STEP).prior
             assert np.linalg.eigvalsh(expected.information).min() > 0
             np.testing.assert_allclose(expected.T_cw[:3, 3], at(11 * STEP)[:3, 3], atol=0.3)
-            motion.update(11 * STEP + leap + k * STEP, at(11 * STEP), SURE)
+            motion.update(11 * STEP + jump + k * STEP, at(11 * STEP), CERTAIN)
 
 
-def test_a_shaken_camera_is_not_held_to_what_was_expected() -> None:
-    """A steady one is, in frames that see little; and one that was shaken, again half a second
-    after a leap.
-    """
+def test_prior_is_disabled_for_shaken_camera() -> None:
+    """The prior counts for a steady camera with few points, and half a second after a jump."""
     motion = moved([k * STEP for k in range(12)])
     assert predict(motion, 12 * STEP).prior_for(100) is not None
     assert predict(motion, 12 * STEP).prior_for(1000) is None
     for k in range(12, 20):
         motion.update(
-            k * STEP, exp_se3(np.array([0.01 * (-1) ** k, 0, 0, 0, 0, 0])) @ at(k * STEP), SURE
+            k * STEP, exp_se3(np.array([0.01 * (-1) ** k, 0, 0, 0, 0, 0])) @ at(k * STEP), CERTAIN
         )
     assert predict(motion, 20 * STEP).prior_for(100) is None
-    motion.update(20 * STEP, exp_se3(np.array([2.0, 0, 0, 0, 0, 0])) @ at(20 * STEP), SURE)
+    motion.update(20 * STEP, exp_se3(np.array([2.0, 0, 0, 0, 0, 0])) @ at(20 * STEP), CERTAIN)
     for k in range(21, 36):
-        motion.update(k * STEP, at(k * STEP), SURE)
+        motion.update(k * STEP, at(k * STEP), CERTAIN)
     assert predict(motion, 36 * STEP).prior_for(100) is not None
 
 
-def test_errors_are_as_large_as_foreseen() -> None:
-    """Cameras shoved at random, seen with noise: squared distances in sigmas from what was expected
-    average 6.
-    """
+def test_prediction_errors_match_covariance() -> None:
+    """The squared Mahalanobis distance of randomly accelerated cameras averages 6."""
     rng, squares = np.random.default_rng(0), []
     for _ in range(40):
         motion, T_cw, velocity = MotionModel(), np.eye(4), rng.normal(0, 0.3, 6)
         for k in range(30):
             if k > 5:
-                off = log_se3(T_cw @ inverse(predict(motion, k * STEP).prior.T_cw))
-                squares.append(off @ predict(motion, k * STEP).prior.information @ off)
+                error = log_se3(T_cw @ inverse(predict(motion, k * STEP).prior.T_cw))
+                squares.append(error @ predict(motion, k * STEP).prior.information @ error)
             motion.update(
-                k * STEP, exp_se3(rng.normal(0, np.full(6, CONFIG.pose_noise_floor))) @ T_cw, SURE
+                k * STEP,
+                exp_se3(rng.normal(0, np.full(6, CONFIG.pose_noise_floor))) @ T_cw,
+                CERTAIN,
             )
-            push = rng.normal(0, ACCELERATION)
-            T_cw = exp_se3(velocity * STEP + push * STEP**2 / 2) @ T_cw
-            velocity = velocity + push * STEP
+            acceleration = rng.normal(0, ACCELERATION)
+            T_cw = exp_se3(velocity * STEP + acceleration * STEP**2 / 2) @ T_cw
+            velocity = velocity + acceleration * STEP
     assert 5.5 < np.mean(squares) < 6.5, np.mean(squares)
 
 
 def world(count: int, spread: float) -> tuple[NDArray[np.float64], Observations]:
-    """Points 2 to 3 m before a camera at the origin, all within `spread` px of each other, measured
-    with 1 px.
+    """Return points 2 to 3 m in front of a camera, and measurements with a noise of 1 px.
+
+    All points project into a square of `spread` px.
     """
     rng = np.random.default_rng(1)
     pixels = np.array([40.0, 40.0]) + rng.uniform(0, spread, (count, 2))
@@ -173,33 +174,37 @@ def world(count: int, spread: float) -> tuple[NDArray[np.float64], Observations]
     )
 
 
-def test_an_expectation_decides_where_little_is_seen_and_only_there() -> None:
+def test_prior_decides_only_with_few_measurements() -> None:
     expected = Prior(np.eye(4), np.diag(np.repeat([0.002, 0.002], 3) ** -2.0))
     errors = {}
     for count, spread in ((20, 30.0), (2000, 200.0)):
-        points, seen = world(count, spread)
-        alone, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA))
-        both, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA), prior=expected)
-        errors[count] = np.linalg.norm(alone[:3, 3]), np.linalg.norm(both[:3, 3])
+        points, observations = world(count, spread)
+        without_prior, _ = optimize_pose(np.eye(4), points, observations, ReprojectionModel(CAMERA))
+        with_prior, _ = optimize_pose(
+            np.eye(4), points, observations, ReprojectionModel(CAMERA), prior=expected
+        )
+        errors[count] = np.linalg.norm(without_prior[:3, 3]), np.linalg.norm(with_prior[:3, 3])
     assert errors[20][0] > 0.01
     assert errors[20][1] < 0.2 * errors[20][0]
-    elsewhere = Prior(exp_se3(np.array([0.01, 0, 0, 0, 0, 0])), expected.information)
-    points, seen = world(2000, 200.0)
-    pulled, _ = optimize_pose(np.eye(4), points, seen, ReprojectionModel(CAMERA), prior=elsewhere)
-    assert np.linalg.norm(pulled[:3, 3]) < 0.004, (
-        "what is seen outweighs an expectation that lies 1 cm off"
+    wrong_prior = Prior(exp_se3(np.array([0.01, 0, 0, 0, 0, 0])), expected.information)
+    points, observations = world(2000, 200.0)
+    fused, _ = optimize_pose(
+        np.eye(4), points, observations, ReprojectionModel(CAMERA), prior=wrong_prior
+    )
+    assert np.linalg.norm(fused[:3, 3]) < 0.004, (
+        "many measurements outweigh a prior that is wrong by 1 cm"
     )
 
 
-def test_the_pull_is_the_gradient_of_the_squared_distance() -> None:
+def test_prior_gradient_equals_finite_differences() -> None:
     rng = np.random.default_rng(2)
     root = rng.normal(size=(6, 6))
     prior = Prior(exp_se3(rng.normal(0, 1, 6)), root @ root.T)
     T_cw = exp_se3(rng.normal(0, 0.003, 6)) @ prior.T_cw
 
     def half_square(xi: NDArray[np.float64]) -> float:
-        off = log_se3(exp_se3(xi) @ T_cw @ inverse(prior.T_cw))
-        return float(off @ prior.information @ off) / 2
+        error = log_se3(exp_se3(xi) @ T_cw @ inverse(prior.T_cw))
+        return float(error @ prior.information @ error) / 2
 
     step = 1e-6
     numeric = [(half_square(step * e) - half_square(-step * e)) / (2 * step) for e in np.eye(6)]
@@ -208,7 +213,7 @@ def test_the_pull_is_the_gradient_of_the_squared_distance() -> None:
     )
 
 
-def test_information_says_how_poses_scatter() -> None:
+def test_pose_information_matches_scatter_of_poses() -> None:
     points, _ = world(60, 100.0)
     rng, true = np.random.default_rng(3), ReprojectionModel(CAMERA)
     local = to_local(np.eye(4), points)
@@ -216,27 +221,31 @@ def test_information_says_how_poses_scatter() -> None:
     steps = []
     for _ in range(300):
         disparity = true.bf / depths + rng.normal(0, 1, 60)
-        seen = Observations(
+        observations = Observations(
             pixels + rng.normal(0, 1, (60, 2)), true.bf / disparity, np.ones(60), np.ones(60)
         )
-        steps.append(log_se3(optimize_pose(np.eye(4), points, seen, true)[0]))
+        steps.append(log_se3(optimize_pose(np.eye(4), points, observations, true)[0]))
     exact = Observations(pixels, depths, np.ones(60), np.ones(60))
-    foreseen = np.sqrt(np.diag(np.linalg.inv(pose_information(np.eye(4), points, exact, true))))
-    np.testing.assert_allclose(np.std(steps, axis=0), foreseen, rtol=0.2)
+    predicted_sigma = np.sqrt(
+        np.diag(np.linalg.inv(pose_information(np.eye(4), points, exact, true)))
+    )
+    np.testing.assert_allclose(np.std(steps, axis=0), predicted_sigma, rtol=0.2)
 
 
-def test_a_frame_that_sees_a_part_of_the_room_does_not_jump() -> None:
-    path = np.concatenate([camera_path(1, later=k / 4) for k in range(60)])  # a calm hand: .2 m/s^2
+def test_prior_reduces_error_of_mostly_masked_frames() -> None:
+    path = np.concatenate(
+        [camera_path(1, later=k / 4) for k in range(60)]
+    )  # a steady camera: 0.2 m/s^2
     views = [render(room(), T_wc) for T_wc in path]
     almost_all = np.ones((240, 320), dtype=np.bool_)
     almost_all[150:, 230:] = False
     errors = {}
-    for few in (0, CONFIG.prior_below_points):
+    for prior_below_points in (0, CONFIG.prior_below_points):
         config = slam_config(
             120,
             smoothing__enabled=False,
             refinement__enabled=False,
-            motion__prior_below_points=few,
+            motion__prior_below_points=prior_below_points,
         )
         slam = Slam(CAMERA, config)
         poses = [
@@ -246,6 +255,8 @@ def test_a_frame_that_sees_a_part_of_the_room_does_not_jump() -> None:
         assert all(0 < pose.num_matches < 150 for pose in poses[10:]), [
             p.inliers for p in poses[10:]
         ]
-        way = slam.trajectory()
-        errors[few] = score(Trajectory(np.arange(len(path)) / 30, path), way)["ate_m"]["rmse"]
+        trajectory = slam.trajectory()
+        errors[prior_below_points] = score(Trajectory(np.arange(len(path)) / 30, path), trajectory)[
+            "ate_m"
+        ]["rmse"]
     assert errors[CONFIG.prior_below_points] < 0.7 * errors[0], errors

@@ -1,4 +1,4 @@
-"""The slam on worlds whose every pose is known."""
+"""Tracking in rendered worlds with known poses."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ NOTHING = np.zeros((240, 320), dtype=np.float32)
 
 
 def ate(slam: Slam, truth: NDArray[np.float64]) -> float:
-    """RMSE, m."""
+    """Return the RMSE of the trajectory, m."""
     stamps = np.arange(len(truth)) / 30
     return score(Trajectory(stamps, truth), slam.trajectory())["ate_m"]["rmse"]
 
@@ -32,7 +32,7 @@ View = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    """The still room along the path."""
+    """Render the static room along the path."""
     return [render(room(), T_wc) for T_wc in camera_path(40)]
 
 
@@ -43,7 +43,7 @@ def run(views: list[View], seed: int = 0) -> tuple[Slam, list[FrameResult]]:
     ]
 
 
-def test_every_frame_of_a_still_room_is_tracked_to_millimetres(views: list[View]) -> None:
+def test_static_room_is_tracked_with_millimeter_accuracy(views: list[View]) -> None:
     slam, poses = run(views)
     assert all(pose.is_tracked for pose in poses)
     assert 2 <= len(slam.map.keyframes) < 25
@@ -51,25 +51,25 @@ def test_every_frame_of_a_still_room_is_tracked_to_millimetres(views: list[View]
     np.testing.assert_array_equal(poses[0].T_wc, np.eye(4))
 
 
-def test_inliers_are_counted_beside_matches(views: list[View]) -> None:
-    """Matches keep outliers of the chi-square test; inliers are those that agree with the pose."""
+def test_result_counts_matches_and_inliers(views: list[View]) -> None:
+    """Matches include outliers of the chi-square test; inliers agree with the pose."""
     slam, poses = run(views)
     others = [pose for pose in poses if not pose.is_keyframe]
     assert all(0 < pose.num_inliers <= pose.num_matches for pose in others)
     assert any(pose.num_inliers < pose.num_matches for pose in others)
     last, extracted = slam.tracker.state.last, others[-1]
     assert last is not None
-    points, seen = slam.map.measured(last.matches, last.features)
-    chi2 = chi_square(last.T_cw, points, seen, ReprojectionModel(CAMERA))
-    assert extracted.num_inliers == np.count_nonzero(chi2 <= seen.chi2_thresholds)
+    points, observations = slam.map.measured(last.matches, last.features)
+    chi2 = chi_square(last.T_cw, points, observations, ReprojectionModel(CAMERA))
+    assert extracted.num_inliers == np.count_nonzero(chi2 <= observations.chi2_thresholds)
 
 
-def test_same_seed_same_bits(views: list[View]) -> None:
+def test_same_seed_gives_identical_trajectory(views: list[View]) -> None:
     first, second = (run(views[:15], seed=3)[0].trajectory().poses for _ in range(2))
     assert first.tobytes() == second.tobytes()
 
 
-def test_the_place_is_found_again_after_a_black_out(views: list[View]) -> None:
+def test_camera_is_relocalized_after_blackout(views: list[View]) -> None:
     slam, path = Slam(CAMERA, slam_config(500)), camera_path(40)
     states = []
     for index in range(40):
@@ -77,46 +77,42 @@ def test_the_place_is_found_again_after_a_black_out(views: list[View]) -> None:
         states.append(track(slam, rgb, depth, index / 30).is_tracked)
     assert all(states[:15])
     assert not any(states[15:22])
-    assert all(states[22:]), (
-        "the camera moved on by seven frames in the dark and must still be found"
-    )
+    assert all(states[22:]), "the camera moved by seven frames in the dark and must be relocalized"
     assert len(slam.trajectory()) == 33, "lost frames have no pose"
     assert ate(slam, path) < 0.005
 
 
-def test_a_calm_camera_asks_the_map_at_once_and_a_jolted_one_first_guesses(
+def test_rough_pose_is_estimated_only_after_sudden_motion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The jolt: the picture moves by 45 px from one frame to the next."""
-    slam, guessed = Slam(CAMERA, slam_config(500)), []
+    """The image moves suddenly by 45 px from one frame to the next."""
+    slam, frames_with_ransac = Slam(CAMERA, slam_config(500)), []
     solve = slam.tracker.parts.localizer._solve
     monkeypatch.setattr(
         slam.tracker.parts.localizer,
         "_solve",
-        lambda *a, **k: guessed.append(len(poses)) or solve(*a, **k),
+        lambda *a, **k: frames_with_ransac.append(len(poses)) or solve(*a, **k),
     )
     path = exp_se3(np.outer(np.arange(24), [0.006, 0.0, 0.0, 0.0, 0.003, 0.0]))
     path[23] = path[23] @ exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.16, 0.0]))
     poses: list[FrameResult] = []
     for index, T_wc in enumerate(path):
         poses.append(track(slam, *render(room(), T_wc)[:2], index / 30))
-    assert set(guessed) == {23}
+    assert set(frames_with_ransac) == {23}
     T_wc = poses[-1].T_wc
     assert T_wc is not None
     np.testing.assert_allclose(T_wc, path[23], atol=0.01)
 
 
-def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five are missing, in which the wall moves by 72 px: no place is looked up, for the motion
-    says where to look.
-    """
+def test_fast_camera_is_tracked_over_dropped_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wall moves by 72 px while five frames are missing; the prediction makes up for it."""
     path = exp_se3(np.outer(np.arange(13) - 5, [0.12, 0.0, 0.01, 0.0, 0.01, 0.0]))
     slam = Slam(CAMERA, slam_config(600))
 
-    def lost(*_: object) -> None:
+    def fail(*_: object) -> None:
         raise AssertionError("the whole map is searched")
 
-    monkeypatch.setattr(slam.tracker.parts.localizer, "relocalize", lost)
+    monkeypatch.setattr(slam.tracker.parts.localizer, "relocalize", fail)
     for k in [*range(4), *range(9, 13)]:
         pose = track(slam, *render(room(), path[k])[:2], k / 30)
         assert pose.T_wc is not None
@@ -124,7 +120,7 @@ def test_a_fast_camera_is_followed_over_dropped_frames(monkeypatch: pytest.Monke
         assert pose.num_matches > 200
 
 
-def test_nothing_to_see_is_lost_not_guessed() -> None:
+def test_frame_without_features_has_no_pose() -> None:
     slam = Slam(CAMERA, slam_config(1000))
     pose = track(slam, BLACK, NOTHING, 0.0)
     assert not pose.is_tracked
@@ -135,14 +131,14 @@ def test_nothing_to_see_is_lost_not_guessed() -> None:
 EVERYTHING = np.ones((240, 320), dtype=np.bool_)
 
 
-def test_a_first_frame_wholly_under_its_mask_is_lost(views: list[View]) -> None:
+def test_fully_masked_first_frame_has_no_pose(views: list[View]) -> None:
     slam = Slam(CAMERA, slam_config(500))
     rgb, depth, _ = views[0]
     assert not track(slam, rgb, depth, 0.0, EVERYTHING).is_tracked
     assert track(slam, rgb, depth, 0.1).is_tracked
 
 
-def test_a_mask_over_everything_costs_no_frame_once_there_is_a_map(views: list[View]) -> None:
+def test_fully_masked_frames_are_tracked_against_map(views: list[View]) -> None:
     slam = Slam(CAMERA, slam_config(500))
     poses = [
         track(slam, rgb, depth, index / 30, EVERYTHING if 10 <= index < 25 else None)
@@ -150,36 +146,36 @@ def test_a_mask_over_everything_costs_no_frame_once_there_is_a_map(views: list[V
     ]
     assert all(pose.is_tracked for pose in poses)
     assert not any(pose.is_keyframe for pose in poses[10:25]), (
-        "what a mask covers never enters the map"
+        "masked surfaces are never added to the map"
     )
     assert ate(slam, camera_path(40)) < 0.005
 
 
-def test_a_picture_matched_whole_takes_depth_at_its_own_time_too(
+def test_whole_image_match_uses_depth_timestamp(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slam = Slam(CAMERA, slam_config(500))
     for index, (rgb, depth, _) in enumerate(views[:4]):
         track(slam, rgb, depth, index / 30)
-    measure, lags = slam.tracker.parts.extractor.measure, []
+    measure, transforms = slam.tracker.parts.extractor.measure, []
 
-    def watched(
+    def record_transform(
         keypoints: Keypoints,
         depth: NDArray[np.float32],
         mask: NDArray[np.bool_] | None,
-        lag: NDArray[np.float64] | None,
+        T_depth_color: NDArray[np.float64] | None,
     ) -> Features:
-        lags.append(lag)
-        return measure(keypoints, depth, mask, lag)
+        transforms.append(T_depth_color)
+        return measure(keypoints, depth, mask, T_depth_color)
 
-    monkeypatch.setattr(slam.tracker.parts.extractor, "measure", watched)
+    monkeypatch.setattr(slam.tracker.parts.extractor, "measure", record_transform)
     assert track(slam, *views[4][:2], 4 / 30, EVERYTHING, depth_timestamp=4 / 30 + 0.01).is_tracked
-    assert len(lags) == 2, "first what is not masked, then all"
-    assert lags[0] is not None
-    np.testing.assert_array_equal(lags[1], lags[0])
+    assert len(transforms) == 2, "first the unmasked keypoints, then all"
+    assert transforms[0] is not None
+    np.testing.assert_array_equal(transforms[1], transforms[0])
 
 
-def test_a_pose_that_is_rejected_judges_no_point(
+def test_rejected_pose_does_not_update_static_odds(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slam = Slam(CAMERA, slam_config(500))
@@ -194,10 +190,10 @@ def test_a_pose_that_is_rejected_judges_no_point(
 
     monkeypatch.setattr("cohdc_train.slam.tracking.localizer.estimate_static_pose", wrong)
     assert not track(slam, *views[2][:2], 2 / 30).is_tracked
-    np.testing.assert_array_equal(slam.map.moving_log_odds, 0)
+    np.testing.assert_array_equal(slam.map.static_odds.moving_log_odds, 0)
 
 
-def test_result_of_a_frame_does_not_change_when_the_map_does(views: list[View]) -> None:
+def test_frame_result_is_independent_of_later_map_changes(views: list[View]) -> None:
     slam = Slam(CAMERA, slam_config(500))
     first = track(slam, *views[0][:2], 0.0)
     assert first.is_keyframe
@@ -212,7 +208,7 @@ def test_result_of_a_frame_does_not_change_when_the_map_does(views: list[View]) 
     np.testing.assert_array_equal(first.features.is_subpixel, before)
 
 
-def test_without_refinement_a_pose_is_rejected_once(
+def test_pose_is_rejected_once_without_refinement(
     views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slam = Slam(CAMERA, slam_config(500, refinement__enabled=False))
@@ -225,7 +221,7 @@ def test_without_refinement_a_pose_is_rejected_once(
     assert len(attempts) == 1
 
 
-def test_status_tells_whether_there_is_a_map(views: list[View]) -> None:
+def test_status_distinguishes_initializing_from_lost(views: list[View]) -> None:
     slam = Slam(CAMERA, slam_config(500))
     frames = [(BLACK, NOTHING), views[0][:2], (BLACK, NOTHING), views[1][:2]]
     statuses = [track(slam, *frame, index / 30).status for index, frame in enumerate(frames)]
@@ -233,18 +229,18 @@ def test_status_tells_whether_there_is_a_map(views: list[View]) -> None:
 
 
 def features_at(
-    points: list[tuple[float, float]], words: list[int], octaves: list[int]
+    points: list[tuple[float, float]], values: list[int], octaves: list[int]
 ) -> Features:
     pixels = np.array(points, dtype=np.float64)
-    descriptors = np.zeros((len(words), 4), dtype=np.uint64)
-    descriptors[:, 0] = words
+    descriptors = np.zeros((len(values), 4), dtype=np.uint64)
+    descriptors[:, 0] = values
     return Features(
         pixels,
         pixels,
         np.array(octaves),
         descriptors,
-        np.ones(len(words)),
-        np.zeros(len(words), bool),
+        np.ones(len(values)),
+        np.zeros(len(values), bool),
     )
 
 
@@ -253,7 +249,7 @@ def features_at(
     [((52.0, 40.0), 0, 0b0, True), ((59.0, 40.0), 0, 0b0, False), ((52.0, 40.0), 2, 0b0, False)],
     ids=["near", "too far", "other level"],
 )
-def test_matching_by_projection(
+def test_projection_match_needs_near_keypoint_of_similar_level(
     keypoint: tuple[float, float], octave: int, word: int, found: bool
 ) -> None:
     features = features_at([keypoint], [word], [octave])
@@ -264,9 +260,8 @@ def test_matching_by_projection(
     assert matches.point_ids.tolist() == ([77] if found else [])
 
 
-def test_matches_are_one_to_one_and_clear() -> None:
-    # point 0 likes corner 0 best; point 1 likes it too but less; point 2 cannot tell corners 1 and
-    # 2 apart
+def test_matches_are_one_to_one_and_unambiguous() -> None:
+    # Points 0 and 1 match keypoint 0 best, point 0 better; point 2 is ambiguous.
     i, j, bits = (
         np.array([0, 0, 1, 2, 2]),
         np.array([0, 1, 0, 1, 2]),
@@ -292,7 +287,7 @@ def test_matches_are_one_to_one_and_clear() -> None:
         ({"t": float("nan")}, r"frame at nan s: not after the frame before it"),
     ],
 )
-def test_frame_that_does_not_fit_is_refused(changes: dict[str, object], message: str) -> None:
+def test_invalid_frame_is_refused(changes: dict[str, object], message: str) -> None:
     slam = Slam(CAMERA, slam_config(500))
     track(slam, BLACK, NOTHING, 1.0)
     frame = {"rgb": BLACK, "depth": NOTHING, "t": 2.0, "mask": None} | changes
