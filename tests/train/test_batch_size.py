@@ -1,9 +1,9 @@
 """The largest batch: worst images, extrapolation, and a real measurement of this process."""
 
-from pathlib import ctypes
+import ctypes
+from pathlib import Path
 
 import coco_toys
-import Path
 import pytest
 import torch
 
