@@ -18,7 +18,7 @@ _LARGEST = {"train": 1014, "val": 180}  # images of the paper's largest tests
 
 @dataclass(frozen=True)
 class Table3Scale:
-    """How large the trainings of `cohdc bench table3` are, relative to the paper's.
+    """Size of the trainings of `cohdc bench table3`, relative to the paper's.
 
     Attributes:
         epochs_scale: factor of the epochs.

@@ -16,7 +16,7 @@ from cohdc_train.types import Image
 
 
 class ModelAdapter(Protocol):
-    """How one kind of ONNX file is run.
+    """Adapter for one kind of ONNX file.
 
     Attributes:
         class_names: name of each label.

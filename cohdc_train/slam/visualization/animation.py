@@ -30,7 +30,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 @dataclass(frozen=True)
 class _Panels:
-    """What is shown of one frame. keypoints, mask: [H, W, 3] RGB."""
+    """Panels of one frame. keypoints, mask: [H, W, 3] RGB."""
 
     timestamp: float
     keypoints: Image
