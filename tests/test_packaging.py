@@ -144,7 +144,7 @@ def test_wheel_detects_with_a_shipped_network_in_an_empty_folder(clean: Clean) -
     clean.run("cohdc", "predict", "wall.png", "--model", "person", "--out", "detected")
     found = json.loads((elsewhere / "detected" / "predictions.json").read_text())
     assert [category["name"] for category in found["categories"]] == ["person"]
-    assert "--sequence" in clean.run("cohdc", "slam", "--help")
+    assert "--settings.seed" in clean.run("cohdc", "slam", "--help")
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_wheel_names_the_missing_extra(clean: Clean, command: str) -> None:
 def test_wheel_tracks_and_scores_a_sequence(clean: Clean) -> None:
     elsewhere = clean.folder / "elsewhere"
     draw_sequence(elsewhere / "wall")
-    clean.run("cohdc", "slam", "--sequence", "wall", "--out", "run")
+    clean.run("cohdc", "slam", "wall", "--out", "run")
     metrics = json.loads((elsewhere / "run" / "metrics.json").read_text())
     assert metrics["coverage"] == 1.0
     assert metrics["ate_m"]["rmse"] < 0.01
