@@ -8,8 +8,7 @@ import numpy as np
 
 from cohdc_train.demo.steps import RUNS
 from cohdc_train.images import read_rgb
-from cohdc_train.trajectory.association import match
-from cohdc_train.trajectory.metrics import align_umeyama
+from cohdc_train.trajectory.metrics import align_to_truth
 from cohdc_train.trajectory.trajectory import Trajectory
 from cohdc_train.types import FloatArray
 
@@ -69,9 +68,7 @@ def _draw_trajectories(axes: "Axes", out: Path, metrics: dict[str, Any]) -> None
     axes.plot(path[:, 0], path[:, 1], color="0.4", linewidth=5, alpha=0.35, label="ground truth")
     for name, title in RUNS.items():
         estimate = Trajectory.load_tum(out / "slam" / name / "trajectory.txt")
-        matched_truth, matched = match(truth, estimate)
-        T = align_umeyama(matched.positions, matched_truth.positions)
-        points = _with_gaps(estimate.transformed(T))
+        points = _with_gaps(align_to_truth(truth, estimate))
         error = metrics[name]["ate_m"]["rmse"]
         label = f"{title}: error {100 * error:.1f} cm"
         axes.plot(points[:, 0], points[:, 1], color=COLORS[name], linewidth=1.6, label=label)

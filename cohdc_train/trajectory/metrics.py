@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cohdc_train.trajectory.association import nearest
+from cohdc_train.trajectory.association import match, nearest
 from cohdc_train.trajectory.trajectory import Trajectory
 from cohdc_train.types import FloatArray
 
@@ -42,6 +42,17 @@ def nearest_rotation(covariance: FloatArray) -> FloatArray:
     signs = np.ones(covariance.shape[:-1])
     signs[..., 2] = np.sign(np.linalg.det(U @ Vt))
     return np.asarray((U * signs[..., None, :]) @ Vt)
+
+
+def align_to_truth(groundtruth: Trajectory, estimate: Trajectory) -> Trajectory:
+    """Align all poses of an estimate to the ground truth, by the poses whose times match.
+
+    Raises:
+        DataError: fewer than three poses match.
+    """
+    matched_truth, matched = match(groundtruth, estimate)
+    T = align_umeyama(matched.positions, matched_truth.positions)
+    return estimate.transformed(T)
 
 
 def ate(groundtruth: Trajectory, estimate: Trajectory) -> FloatArray:

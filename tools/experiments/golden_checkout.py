@@ -11,33 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from cohdc_train.slam.run import RENAMED_OPTIONS as SLAM_RENAMED_OPTIONS
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 # Options of `cohdc` and of tools that got another name. The cases use the old one.
 # Old name: new name; an empty one for an option whose value became positional.
-RENAMED_OPTIONS = {
-    "--sequence": "",
-    "--seed": "--settings.seed",
-    "--view": "--viewer",
-    "--idle": "--idle_timeout",
-    "--cloud": "--dense_cloud",
-    "--features": "--settings.features.max_keypoints",
-    "--culling.dynamic_classes": "--settings.masks.dynamic_classes",
-    "--culling.score": "--settings.masks.min_score",
-    "--culling.quality": "--settings.masks.min_quality",
-    "--culling.dilate": "--settings.masks.dilation_px",
-    "--culling.doubt": "--settings.masks.quality_dilation",
-    "--method.loops": "--settings.loops.enabled",
-    "--method.refinement": "--settings.refinement.enabled",
-    "--method.geometry": "--settings.free_space.enabled",
-    "--method.static_weights": "--settings.motion_segmentation.enabled",
-    "--method.global_adjustment": "--settings.bundle_adjustment.global_enabled",
-    "--method.every_frame": "--settings.bundle_adjustment.use_all_frames",
-    "--method.smoothing": "--settings.smoothing.enabled",
-    "--method.keyframe_culling": "--settings.keyframe_culling.enabled",
-    "--method.flow": "--settings.flow.enabled",
-    "--pictures": "--figures",
-}
+RENAMED_OPTIONS = {**SLAM_RENAMED_OPTIONS, "--sequence": "", "--pictures": "--figures"}
 # Where a program lies, the newest place first, relative to a checkout.
 _TOOL_PLACES = {"late_masks": ("tools/experiments/late_masks.py", "tools/late_masks")}
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

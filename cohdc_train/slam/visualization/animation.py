@@ -13,8 +13,7 @@ from cohdc_train.slam.features.orb import OrbExtractor
 from cohdc_train.slam.frame import FrameResult, RGBDFrame
 from cohdc_train.slam.mapping.map import Map
 from cohdc_train.slam.visualization.overlays import draw_before
-from cohdc_train.trajectory.association import match
-from cohdc_train.trajectory.metrics import align_umeyama
+from cohdc_train.trajectory.metrics import align_to_truth
 from cohdc_train.trajectory.trajectory import Trajectory
 from cohdc_train.types import FloatArray, Image
 
@@ -187,7 +186,6 @@ class _TrajectoryPanel:
 def _align(trajectory: Trajectory, truth: Trajectory) -> Trajectory:
     """Align to the ground truth; too few common poses leave the trajectory as it is."""
     try:
-        matched_truth, matched = match(truth, trajectory)
+        return align_to_truth(truth, trajectory)
     except DataError:
         return trajectory
-    return trajectory.transformed(align_umeyama(matched.positions, matched_truth.positions))
